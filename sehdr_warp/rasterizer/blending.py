@@ -1,15 +1,14 @@
 """The last stage of a render: blend the tile lists front to back, any number of channels in one pass.
 
 blend() calls the backend of its device, blend_on_cpu() or blend_on_cuda(), which fills the image and returns its
-backward pass: a TileBackward or BlockBackward. Called with the gradients with respect to image and transmittance (None
-for 0), it returns the gradients by Gaussian, [N, C + 6 or more]: features, conic a b c, x, y, opacity, and columns that
-pad a row. with_gradient() makes this a node of the autograd graph.
+backward pass. Called with the gradients with respect to image and transmittance (None for 0), that returns the
+gradients by Gaussian, [N, C + 6 or more]: features, conic a b c, x, y, opacity, and columns that pad a row.
+with_gradient() makes this a node of the autograd graph.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,6 +17,7 @@ from ..kernels import blend_cpu
 from ..kernels.constants import TILE_SIZE
 from ..parallel import thread_count
 from .block_blending import blend_on_cuda
+from .projection import Splats
 from .tile_lists import PackedSplats, TileLists
 from .torch_contract import direct_apply, keeps_graph, once_differentiable
 from .warp_launch.launching import launch, warp_scalar
@@ -44,32 +44,16 @@ class BlendResult(NamedTuple):
 
 
 def blend(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    lists: TileLists,
-    packed: PackedSplats,
-    alpha_threshold: float,
-    deterministic: bool = False,
+    splats: Splats, lists: TileLists, packed: PackedSplats, alpha_threshold: float, deterministic: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Blend features over the tile lists; return the image [H, W, C] and the transmittance [H, W].
+    """Blend splats over their tile lists; return the image [H, W, C] and the transmittance [H, W].
 
-    Differentiable once with respect to the first four. Which intersections count is decided by the lists and by
-    alpha_threshold, and is constant in the derivative.
+    Differentiable once with respect to means, conics, opacities and features. Which intersections count is decided by
+    the lists and by alpha_threshold, and is constant in the derivative.
 
-    Args:
-        means2d: [N, 2].
-        conics: [N, 3].
-        opacities: [N].
-        features: [N, C].
-        lists: of the Gaussians.
-        packed: of means2d, conics, opacities and alpha_threshold.
-        alpha_threshold: contributions with a smaller alpha are left out.
-        deterministic: on a GPU, sum gradients in a fixed order, as the CPU always does. Slower, and the gradients of
-            every intersection take memory.
+    deterministic: on a GPU, sum gradients in a fixed order, as the CPU always does.
     """
-    channels = features.shape[1]
+    features, channels = splats.features, splats.features.shape[1]
     image = features.new_empty(lists.height, lists.width, channels)
     transmittance = features.new_empty(image.shape[:2])
     backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
@@ -83,7 +67,8 @@ def blend(
         grad_features, grad_conics, grad_means2d, opacity_and_padding = gradients.split_with_sizes(sizes, 1)
         return grad_means2d, grad_features, grad_conics, opacity_and_padding.select(1, 0)
 
-    return with_gradient(BlendResult(image, transmittance, backward), means2d, features, conics, opacities)
+    result = BlendResult(image, transmittance, backward)
+    return with_gradient(result, splats.means2d, features, splats.conics, splats.opacities)
 
 
 def with_gradient(
@@ -139,90 +124,41 @@ def blend_on_cpu(
     transmittance: Tensor,
     alpha_threshold: float,
     deterministic: bool,
-) -> "TileBackward":
+) -> Callable[[Tensor, Tensor | None], Tensor]:
     """Fill image [H, W, C] and transmittance [H, W] by tiles; sums have a fixed order, deterministic or not."""
-    assert lists.emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
+    emit_order, tiles, channels = lists.emit_order, lists.grid.tiles, features.shape[1]
+    assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
     highest = float(packed.means_opacities[:, 2].max()) if len(features) else 0.0
-    squarings = exp_squarings(alpha_threshold / max(highest, 1.0))
-    tiles = _Tiles(features, lists, packed, alpha_threshold, squarings, balanced_ranges(lists))
-    channels = image.shape[2]
-    tile_transmittance, last_contributor = tiles.scratch(ROWS_OF_TILE), tiles.scratch(ROWS_OF_TILE)
-    inputs = lists.tile_ranges, lists.gaussians, *tiles.shared_arguments()
+    kind = warp_scalar(features.dtype), channels, exp_squarings(alpha_threshold / max(highest, 1.0))
+    ranges = balanced_ranges(lists)
+    lane_offsets = torch.arange(blend_cpu.LANES, dtype=features.dtype, device=features.device)
+    sizes = lists.grid.columns, lists.width, lists.height
+    shared = packed.means_opacities, packed.conics_cutoffs, features, *sizes, alpha_threshold, lane_offsets
+
+    def scratch(*shape: int) -> Tensor:
+        return features.new_empty(tiles, *shape, blend_cpu.LANES)
+
+    tile_transmittance, last_contributor = scratch(ROWS_OF_TILE), scratch(ROWS_OF_TILE)
+    inputs = lists.tile_ranges, lists.gaussians, *shared
     outputs = last_contributor, image.view(-1, channels), transmittance
-    arguments = *inputs, tile_transmittance, tiles.scratch(channels, ROWS_OF_TILE), *outputs
-    tiles.launch(blend_cpu.forward_kernel, *arguments)
-    return TileBackward(tiles, transmittance, tile_transmittance, last_contributor)
+    arguments = *inputs, tile_transmittance, scratch(channels, ROWS_OF_TILE), *outputs
+    launch(blend_cpu.forward_kernel(*kind), tiles, *arguments, ranges=ranges)
 
-
-@dataclass(frozen=True)
-class _Tiles:
-    """Values that the forward and the backward pass of blend_on_cpu() share.
-
-    Attributes:
-        features: [N, C].
-        lists: to blend.
-        packed: Gaussians to blend.
-        alpha_threshold: contributions with a smaller alpha are left out.
-        squarings: see exp_squarings().
-        ranges: of tiles, see balanced_ranges().
-    """
-
-    features: Tensor
-    lists: TileLists
-    packed: PackedSplats
-    alpha_threshold: float
-    squarings: int
-    ranges: Tensor
-
-    def launch(self, kernel_of: Callable[..., Any], *arguments: Any) -> None:
-        """Launch a kernel over the tiles; kernel_of makes it for a scalar type and a number of channels."""
-        kernel = kernel_of(warp_scalar(self.features.dtype), self.features.shape[1], self.squarings)
-        launch(kernel, self.lists.grid.tiles, *arguments, ranges=self.ranges)
-
-    def scratch(self, *shape: int) -> Tensor:
-        """Allocate vectors of LANES numbers for each tile, [tiles, *shape, LANES]."""
-        return self.features.new_empty(self.lists.grid.tiles, *shape, blend_cpu.LANES)
-
-    def shared_arguments(self) -> tuple[Any, ...]:
-        """Return the arguments that both kernels take after the intersections."""
-        lists, packed = self.lists, self.packed
-        lane_offsets = torch.arange(blend_cpu.LANES, dtype=self.features.dtype, device=self.features.device)
-        sizes = lists.grid.columns, lists.width, lists.height
-        return packed.means_opacities, packed.conics_cutoffs, self.features, *sizes, self.alpha_threshold, lane_offsets
-
-
-@dataclass(frozen=True)
-class TileBackward:
-    """The backward pass of blend_on_cpu().
-
-    Attributes:
-        tiles: that were blended.
-        transmittance: [H, W], the result.
-        tile_transmittance: the same by tile; the kernel takes it back to the front, in place.
-        last_contributor: by tile, of the forward kernel.
-    """
-
-    tiles: _Tiles
-    transmittance: Tensor
-    tile_transmittance: Tensor
-    last_contributor: Tensor
-
-    def __call__(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
-        """Return the gradients by Gaussian."""
-        tiles, lists, channels = self.tiles, self.tiles.lists, grad_image.shape[2]
-        emit_order = lists.emit_order
-        assert emit_order is not None
+    def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
         if grad_transmittance is None:
-            grad_transmittance = torch.zeros_like(self.transmittance)
-        tile_transmittance = self.tile_transmittance.clone() if keeps_graph() else self.tile_transmittance
-        grad_intersections = tiles.features.new_empty(lists.intersection_count, channels + 6)
-        inputs = lists.tile_ranges, lists.gaussians, emit_order.emit_indices, *tiles.shared_arguments()
-        gradients = self.last_contributor, grad_image.view(-1, channels), grad_transmittance, tile_transmittance
-        scratch = tiles.scratch(ROWS_OF_TILE), tiles.scratch(channels, ROWS_OF_TILE)
-        scratch += tiles.scratch(TILE_SIZE), tiles.scratch(TILE_SIZE), tiles.scratch(channels + 6)
-        arguments = *inputs, *gradients, *scratch, grad_intersections
-        tiles.launch(blend_cpu.backward_kernel, *arguments)
+            grad_transmittance = torch.zeros_like(transmittance)
+        # The kernel takes it back to the front, in place.
+        to_front = tile_transmittance.clone() if keeps_graph() else tile_transmittance
+        grad_intersections = features.new_empty(lists.intersection_count, channels + 6)
+        gradients = last_contributor, grad_image.view(-1, channels), grad_transmittance, to_front
+        by_pixel = scratch(ROWS_OF_TILE), scratch(channels, ROWS_OF_TILE)
+        by_row = scratch(TILE_SIZE), scratch(TILE_SIZE), scratch(channels + 6)
+        inputs = lists.tile_ranges, lists.gaussians, emit_order.emit_indices, *shared
+        arguments = *inputs, *gradients, *by_pixel, *by_row, grad_intersections
+        launch(blend_cpu.backward_kernel(*kind), tiles, *arguments, ranges=ranges)
         return emit_order.sum_by_gaussian(grad_intersections)
+
+    return backward
 
 
 def exp_squarings(smallest: float) -> int:

@@ -14,6 +14,7 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, NEAR_PLANE
 from .losses.ssim import ssim, ssim_map
 from .ops.harmonics import check_harmonics, spherical_harmonics
+from .projection import RasterTensors
 from .rasterization import Rendering, check_shapes, rasterize
 from .render_options import RenderOptions
 from .sphere import rasterize_directions
@@ -97,8 +98,7 @@ def _run_rasterize(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
 
 
 def _fake_rasterize(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
-    arguments: Any = (*tensors[:7], tensors[7] if len(tensors) > 7 else None)
-    check_shapes(*arguments)
+    check_shapes(RasterTensors(*tensors[:7]), tensors[7] if len(tensors) > 7 else None)
     options = RenderOptions(*values)
     height, width = options.height, options.width
     means, features, pose = tensors[0], tensors[4], tensors[5]

@@ -1,4 +1,8 @@
-"""Stage one of a render: project Gaussians to the image. Projected ones, 2D Gaussians, are called splats."""
+"""Stage one of a render: project Gaussians to the image. 2D Gaussians with their features are called splats.
+
+Outputs of a projection kernel end with one that is 0 if a Gaussian is culled, here called visibility: the extents, or
+of rasterize_directions() the distances. The adjoint reads it, and none of the other outputs.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -50,10 +54,14 @@ class ProjectedGaussians(NamedTuple):
     extents: Tensor
 
 
-class RasterInputs(NamedTuple):
-    """2D Gaussians with features [N, C], as the stages after projection read them: contiguous."""
+class Splats(NamedTuple):
+    """ProjectedGaussians and their features [N, C], as the stages after projection read them: contiguous."""
 
-    projected: ProjectedGaussians
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    opacities: Tensor
+    extents: Tensor
     features: Tensor
 
 
@@ -68,17 +76,9 @@ def project_to_camera(
     *,
     differentiate_compensation: bool = False,
 ) -> ProjectedGaussians:
-    """Project Gaussians to the image plane of one camera; all but the extents are differentiable.
+    """Project Gaussians to one camera, tensors as rasterize() takes them; all but the extents are differentiable.
 
-    Args:
-        means: [N, 3].
-        log_scales: [N, 3].
-        quaternions: [N, 4] (w, x, y, z), of any length.
-        opacities: [N].
-        world_to_camera: [4, 4].
-        intrinsics: [4] fx, fy, cx, cy in pixels.
-        options: of the image; extents end where alpha falls to options.alpha_threshold.
-        differentiate_compensation: differentiate the factor of antialiased opacities with respect to the covariance.
+    differentiate_compensation: differentiate the factor of antialiased opacities with respect to the covariance.
     """
     antialiased = options.antialiased
     kernel = projection_kernel(warp_scalar(means.dtype), antialiased, differentiate_compensation and antialiased)
@@ -101,10 +101,10 @@ def launch_projection(
     Does what bridge.differentiable() would, at half of its host time.
 
     Args:
-        kernel: takes inputs, parameters, for the adjoint the last output of the forward pass (else None), and outputs.
+        kernel: takes inputs, parameters, visibility in the adjoint (else None), and outputs.
         inputs: four tensors with a row for each Gaussian, then those that all share (the camera); contiguous.
         parameters: that are not tensors.
-        outputs: with a row for each Gaussian. The last one is 0 if a Gaussian is culled, and not differentiable.
+        outputs: with a row for each Gaussian; the last one, visibility, is not differentiable.
     """
     count = len(inputs[0])
     arguments = *inputs, *parameters, None, *outputs
@@ -126,8 +126,8 @@ def launch_projection(
 ProjectionBackward = Callable[
     [Sequence[Tensor], Tensor, Sequence[Tensor | None], Sequence[bool]], Sequence[Tensor | None]
 ]
-"""Takes the inputs, the last output, a gradient for each output (None for 0), and which inputs need one; returns a
-gradient for each input, None if none is needed."""
+"""Takes the inputs, visibility, a gradient for each output (None for 0), and which inputs need one; returns a gradient
+for each input, None if none is needed."""
 
 
 def adjoint_arguments(
@@ -139,7 +139,7 @@ def adjoint_arguments(
 ) -> tuple[tuple, tuple]:
     """Return arguments of a projection kernel and, for each, its gradient or None, as launch() takes them.
 
-    See ProjectionBackward; results are added to. The adjoint reads none of the outputs but the last one, visibility.
+    See ProjectionBackward; results are added to.
     """
     arguments = *inputs, *parameters, visibility, *(None,) * len(upstream)
     return arguments, (*results, *(None,) * (len(parameters) + 1), *upstream)

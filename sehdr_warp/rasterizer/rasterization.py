@@ -1,8 +1,8 @@
 """Differentiable rasterization of 3D Gaussians: project, order, list by tile, blend.
 
 A call, from top to bottom: rasterize() checks its arguments. _begin_view() projects the Gaussians to a camera
-(projection.py); they are called splats then. _finish_view() goes on with render_projected(): list_splats() packs the
-splats, orders them by depth and lists them by tile (tile_lists.py), and blend() blends the lists (blending.py).
+(projection.py); they are called splats then. _finish_view() goes on with render_projected(), which packs the
+splats, orders them by depth, lists them by tile (tile_lists.py), and blends the lists (blending.py).
 
 On a GPU, a call like earlier ones is replayed as a CUDA graph instead: _begin_view() then renders all of it, and
 _finish_view() waits for the number of intersections, which tells whether the graph's memory was enough. These are two
@@ -22,11 +22,10 @@ from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
 from .checks import check_cameras, check_opacities, check_tensors
 from .cuda_graphs.cache import GraphPool, ReplayedRender, find_pool, get_or_create_pool
-from .cuda_graphs.captured_render import flatten
 from .memory import oom_context
-from .projection import ProjectedGaussians, RasterInputs, RasterTensors, project_to_camera
+from .projection import ProjectedGaussians, RasterTensors, Splats, project_to_camera
 from .render_options import RenderOptions
-from .tile_lists import PackedSplats, TileLists, build_tile_lists, order_intersections, pack_splats
+from .tile_lists import build_tile_lists, order_intersections, pack_splats
 from .torch_contract import torch_operation
 
 
@@ -154,7 +153,7 @@ def rasterize(
     # A call like an earlier one, which a CUDA graph can render, has arguments that were checked then.
     pool = find_pool(tensors, options)
     if pool is None or background is not None:
-        check_shapes(*tensors, background)
+        check_shapes(tensors, background)
         check_opacities(opacities)
         check_cameras(world_to_camera, intrinsics)
         options = options.checked(means.device)
@@ -174,32 +173,23 @@ def rasterize(
             raise
 
 
-def check_shapes(
-    means: Any,
-    log_scales: Any,
-    quaternions: Any,
-    opacities: Any,
-    features: Any,
-    world_to_camera: Any,
-    intrinsics: Any,
-    background: Any,
-) -> None:
+def check_shapes(tensors: RasterTensors, background: Any) -> None:
     """Raise what rasterize() does for tensors whose shapes, dtypes or devices do not fit."""
-    cameras: tuple[str, ...] = ("B",) if isinstance(world_to_camera, Tensor) and world_to_camera.ndim == 3 else ()
-    opacity_axes, feature_axes = (
-        cameras if isinstance(tensor, Tensor) and tensor.ndim == ndim else ()
-        for tensor, ndim in ((opacities, 2), (features, 3))
-    )
+    means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
+
+    def axes(tensor: Any, ndim: int) -> tuple[str, ...]:
+        return ("B",) if isinstance(tensor, Tensor) and tensor.ndim == ndim else ()
+
+    cameras = axes(world_to_camera, 3)
     backgrounds = {}
     if background is not None:
-        axes = cameras if isinstance(background, Tensor) and background.ndim == 2 else ()
-        backgrounds = {"background": (background, (*axes, "C"))}
+        backgrounds = {"background": (background, (*(cameras and axes(background, 2)), "C"))}
     check_tensors(
         means=(means, ("N", 3)),
         log_scales=(log_scales, ("N", 3)),
         quaternions=(quaternions, ("N", 4)),
-        opacities=(opacities, (*opacity_axes, "N")),
-        features=(features, (*feature_axes, "N", "C")),
+        opacities=(opacities, (*(cameras and axes(opacities, 2)), "N")),
+        features=(features, (*(cameras and axes(features, 3)), "N", "C")),
         world_to_camera=(world_to_camera, (*cameras, 4, 4)),
         intrinsics=(intrinsics, (*cameras, 4)),
         **backgrounds,
@@ -284,28 +274,30 @@ def render_projected(
         features = torch.cat([features, depths[:, None]], 1)
     features = features.contiguous()
     # extents.data: pack_splats() writes to it in place, which torch's check of saved tensors must not see.
-    inputs = RasterInputs(projected._replace(extents=extents.data), features)
+    splats = Splats(means2d, conics, depths, opacities, extents.data, features)
     if replays and store_absolute is None and extents.is_contiguous():
-        tensors = flatten(inputs)
-        pool = get_or_create_pool(tensors, options)
-        graph = None if pool is None else pool.begin_render(tensors, options)
+        pool = get_or_create_pool(splats, options)
+        graph = None if pool is None else pool.begin_render(splats, options)
         if graph is not None:
-            blended = graph.render_projected(tensors, extents.data)
+            blended = graph.render_projected(splats)
             image, transmittance = with_gradient(blended, means2d, features, conics, opacities)
             count = graph.count_intersections()
             if count is not None:
                 return _rendering(options, image, transmittance, means2d, depths, extents, count)
-    lists, packed = list_splats(inputs._replace(features=features.detach()), options)
-    image, transmittance = blend(
-        means2d, conics, opacities, features, lists, packed, options.alpha_threshold, options.deterministic
-    )
+    width, height = options.width, options.height
+    packed = pack_splats(splats, options.alpha_threshold, width, height)
+    # Sums of gradients in a fixed order need it, atomics of a GPU do not.
+    keep_emit_order = features.device.type == "cpu" or options.deterministic
+    offsets = order_intersections(packed, keep_emit_order=keep_emit_order)
+    lists = build_tile_lists(packed, offsets, width, height, options.max_intersections)
+    image, transmittance = blend(splats, lists, packed, options.alpha_threshold, options.deterministic)
     if store_absolute is not None:
         image, transmittance = watch_absolute_gradients(
             image, transmittance, features, lists, packed, options.alpha_threshold, store_absolute
         )
     needed = None if options.max_intersections is None else lists.total
-    splats = means2d, depths, extents
-    return _rendering(options, image, transmittance, *splats, lists.intersection_count, lists.overflow, needed)
+    results = image, transmittance, means2d, depths, extents
+    return _rendering(options, *results, lists.intersection_count, lists.overflow, needed)
 
 
 def _rendering(options: RenderOptions, image: Tensor, *others: Any) -> Rendering:
@@ -314,17 +306,6 @@ def _rendering(options: RenderOptions, image: Tensor, *others: Any) -> Rendering
     if options.depth:
         rendering.image, rendering.depth = image[..., :-1], image[..., -1]
     return rendering
-
-
-def list_splats(inputs: RasterInputs, options: RenderOptions) -> tuple[TileLists, PackedSplats]:
-    """Return the tile lists of 2D Gaussians and their packed form, as blend() takes them."""
-    width, height = options.width, options.height
-    # Sums of gradients in a fixed order need it, atomics of a GPU do not.
-    keep_emit_order = inputs.features.device.type == "cpu" or options.deterministic
-    packed = pack_splats(inputs, options.alpha_threshold, width, height)
-    depths, extents = inputs.projected.depths, inputs.projected.extents
-    offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=keep_emit_order)
-    return build_tile_lists(packed, offsets, depths, extents, width, height, options.max_intersections), packed
 
 
 def join_renderings(means2d: Tensor, renderings: list[Rendering]) -> Rendering:

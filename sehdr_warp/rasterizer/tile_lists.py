@@ -1,4 +1,4 @@
-"""The middle stages of a render: pack 2D Gaussians, order them by depth, and list for each tile those that touch it.
+"""The middle stages of a render: pack splats, order them by depth, and list for each tile those that touch it.
 
 An *intersection* is a pair of a Gaussian and a tile that it touches. They are emitted Gaussian by Gaussian, then sorted
 by tile.
@@ -16,7 +16,7 @@ from ..kernels import tiles as kernels
 from ..kernels.blend_cuda import padded_channels
 from ..kernels.constants import TILE_SIZE
 from ..parallel import thread_count
-from .projection import RasterInputs
+from .projection import Splats
 from .render_options import MAX_INTERSECTIONS
 from .warp_launch.launching import FixedLaunch, fixed_launch, launch, sort_pairs, warp_scalar
 from .warp_launch.threads import torch_threads
@@ -27,13 +27,15 @@ MIN_CHUNK = 1 << 14  # Intersections that are worth a thread's time.
 
 
 class PackedSplats(NamedTuple):
-    """Values of each 2D Gaussian that blending reads, in rows of four, and its number of tiles.
+    """Values of each splat that the lists and blending read; those of blending in rows of four.
 
     Attributes:
         means_opacities: [N, 4] x, y, opacity, half-height.
         conics_cutoffs: [N, 4] conic a, b, c, and the value of a dx^2 + 2 b dx dy + c dy^2 at which alpha meets the
             threshold; -1 if culled.
         counts: [N] int64 tiles that the ellipse touches.
+        depths: [N] as of Splats.
+        extents: [N, 2] as of Splats.
         padded: [N, columns] features with columns of zeros for whole rows of four, which block kernels read at once;
             None if they do not read them from here.
     """
@@ -41,6 +43,8 @@ class PackedSplats(NamedTuple):
     means_opacities: Tensor
     conics_cutoffs: Tensor
     counts: Tensor
+    depths: Tensor
+    extents: Tensor
     padded: Tensor | None = None
 
 
@@ -142,15 +146,15 @@ class TileLists:
 
 
 def pack_splats(
-    inputs: RasterInputs, alpha_threshold: float, width: int, height: int, *, pads: bool | None = None
+    splats: Splats, alpha_threshold: float, width: int, height: int, *, pads: bool | None = None
 ) -> PackedSplats:
-    """Pack 2D Gaussians for an image, and count the tiles that each one's ellipse touches.
+    """Pack splats for an image, and count the tiles that each one's ellipse touches.
 
-    Culls Gaussians whose features are not finite: sets their rows of inputs.projected.extents to 0 in place.
+    Culls those whose features are not finite: sets their rows of splats.extents to 0 in place.
 
     pads: whether to make PackedSplats.padded; by default on a GPU, if the channels are not a multiple of four.
     """
-    features = inputs.features
+    features = splats.features
     count, channels = features.shape
     if pads is None:
         pads = features.device.type == "cuda" and channels % 4 > 0
@@ -158,51 +162,48 @@ def pack_splats(
         features.new_empty(count, 4),
         features.new_empty(count, 4),
         torch.empty(count, dtype=torch.int64, device=features.device),
+        splats.depths,
+        splats.extents,
         features.new_empty(count, padded_channels(channels)) if pads else None,
     )
     kernel = kernels.tile_kernels(warp_scalar(features.dtype)).pack_splats
-    launch(kernel, count, *_pack_arguments(inputs, packed, alpha_threshold, width, height))
+    launch(kernel, count, *_pack_arguments(splats, packed, alpha_threshold, width, height))
     return packed
 
 
 def fixed_pack_splats(
-    inputs: RasterInputs, packed: PackedSplats, alpha_threshold: float, width: int, height: int
+    splats: Splats, packed: PackedSplats, alpha_threshold: float, width: int, height: int
 ) -> FixedLaunch:
     """Return the launch that fills `packed` anew, whose tensors stay where they are but for the features."""
-    kernel = kernels.tile_kernels(warp_scalar(inputs.features.dtype)).pack_splats
-    arguments = _pack_arguments(inputs, packed, alpha_threshold, width, height)
-    return fixed_launch(kernel, len(inputs.features), *arguments, by_address=(inputs.features,))
+    kernel = kernels.tile_kernels(warp_scalar(splats.features.dtype)).pack_splats
+    arguments = _pack_arguments(splats, packed, alpha_threshold, width, height)
+    return fixed_launch(kernel, len(splats.features), *arguments, by_address=(splats.features,))
 
 
 def _pack_arguments(
-    inputs: RasterInputs, packed: PackedSplats, alpha_threshold: float, width: int, height: int
+    splats: Splats, packed: PackedSplats, alpha_threshold: float, width: int, height: int
 ) -> tuple[Any, ...]:
-    (means2d, conics, _, opacities, extents), features = inputs
-    means_opacities, conics_cutoffs, counts, padded = packed
+    means2d, conics, _, opacities, extents, features = splats
+    padded = None if packed.padded is None else packed.padded.view(-1, 4)
     return (
         *(means2d, conics, opacities, features, features.shape[1], alpha_threshold, *tile_grid(width, height)),
-        *(extents, means_opacities, conics_cutoffs, counts, None if padded is None else padded.view(-1, 4)),
+        *(extents, packed.means_opacities, packed.conics_cutoffs, packed.counts, padded),
     )
 
 
 @torch.no_grad()
-def order_intersections(
-    counts: Tensor, depths: Tensor, extents: Tensor, *, keep_emit_order: bool = True
-) -> IntersectionOffsets:
+def order_intersections(packed: PackedSplats, *, keep_emit_order: bool = True) -> IntersectionOffsets:
     """Return the order in which Gaussians emit intersections, by depth, and the running number of these.
 
     If the order need not be kept, a sort of few Gaussians is spared: that of their intersections then sorts by depth.
 
-    Args:
-        counts: [N] of PackedSplats.
-        depths: [N].
-        extents: [N, 2]; 0 if culled.
-        keep_emit_order: let build_tile_lists() return TileLists.emit_order, which backward passes need to sum by
-            Gaussian in a fixed order.
+    keep_emit_order: let build_tile_lists() return TileLists.emit_order, which backward passes need to sum by Gaussian
+        in a fixed order.
     """
+    counts, depths = packed.counts, packed.depths
     if len(depths) <= MAX_SINGLE_SORT and not keep_emit_order and depths.dtype == torch.float32:
         return IntersectionOffsets(None, counts.cumsum(0), keep_emit_order)
-    order = depth_order(depths, extents)
+    order = depth_order(depths, packed.extents)
     with torch_threads(counts.device):
         counts = counts[order]
     return IntersectionOffsets(order, counts.cumsum(0), keep_emit_order)
@@ -210,30 +211,16 @@ def order_intersections(
 
 @torch.no_grad()
 def build_tile_lists(
-    packed: PackedSplats,
-    offsets: IntersectionOffsets,
-    depths: Tensor,
-    extents: Tensor,
-    width: int,
-    height: int,
-    max_intersections: int | None = None,
+    packed: PackedSplats, offsets: IntersectionOffsets, width: int, height: int, max_intersections: int | None = None
 ) -> TileLists:
-    """List for each tile the Gaussians whose ellipse touches it, nearest first.
+    """List for each tile of an image the Gaussians whose ellipse touches it, nearest first.
 
-    Args:
-        packed: of the Gaussians, for an image of this size.
-        offsets: of order_intersections().
-        depths: [N].
-        extents: [N, 2].
-        width: of the image, pixels.
-        height: of the image, pixels.
-        max_intersections: allocate memory for this many; those beyond it are left out, see TileLists.overflow. The host
-            then does not wait for the device to learn how many there are.
+    max_intersections: allocate memory for this many; those beyond it are left out, see TileLists.overflow. The host
+        then does not wait for the device to learn how many there are.
 
-    Raises:
-        SehdrError: if there are more than MAX_INTERSECTIONS.
+    Raises SehdrError if there are more than MAX_INTERSECTIONS.
     """
-    grid, count = tile_grid(width, height), len(depths)
+    grid, count = tile_grid(width, height), len(packed.depths)
     order, cumulative_counts, keep_emit_order = offsets
     total = cumulative_counts[-1] if count else cumulative_counts.new_zeros(())
     overflow = None
@@ -241,7 +228,7 @@ def build_tile_lists(
         overflow = (torch.empty if count else torch.zeros)((), dtype=torch.bool, device=cumulative_counts.device)
     length = int(total) if max_intersections is None else max_intersections
     check_intersection_count(length, count, grid)
-    keys, gaussians = emit_intersections(packed, offsets, depths, extents, grid, length, overflow)
+    keys, gaussians = emit_intersections(packed, offsets, grid, length, overflow)
     if order is None:
         sort_pairs(keys, gaussians, length, kernels.DEPTH_BITS + grid.tiles.bit_length())
         gaussians = gaussians[:length]
@@ -278,13 +265,7 @@ def check_intersection_count(length: int, count: int, grid: TileGrid) -> None:
 
 
 def emit_intersections(
-    packed: PackedSplats,
-    offsets: IntersectionOffsets,
-    depths: Tensor,
-    extents: Tensor,
-    grid: TileGrid,
-    length: int,
-    overflow: Tensor | None = None,
+    packed: PackedSplats, offsets: IntersectionOffsets, grid: TileGrid, length: int, overflow: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return sort keys and Gaussians of all intersections.
 
@@ -295,15 +276,15 @@ def emit_intersections(
     tile grid.tiles. Writes to overflow, a scalar bool, whether there are more than `length`.
     """
     order, cumulative_counts, _ = offsets
-    count, device = len(depths), depths.device
+    count, device = len(packed.depths), packed.depths.device
     keys = torch.empty(2 * length, dtype=torch.int64 if order is None else torch.int32, device=device)
     gaussians = torch.empty(2 * length, dtype=torch.int32, device=device)
     if not count:
         keys[:length], gaussians[:length] = grid.tiles << (kernels.DEPTH_BITS if order is None else 0), 0
     elif length:
         emit = kernels.tile_kernels(warp_scalar(packed.means_opacities.dtype))
-        kernel, depths_in_keys = (emit.emit_keys, depths) if order is None else (emit.emit_intersections, None)
-        inputs = order, packed.means_opacities, packed.conics_cutoffs, extents, depths_in_keys, *grid
+        kernel, depths = (emit.emit_keys, packed.depths) if order is None else (emit.emit_intersections, None)
+        inputs = order, packed.means_opacities, packed.conics_cutoffs, packed.extents, depths, *grid
         launch(kernel, count, *inputs, cumulative_counts, length, keys, gaussians, overflow)
     return keys, gaussians
 

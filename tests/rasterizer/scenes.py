@@ -1,11 +1,10 @@
 """Small random scenes and error measures for the splatting tests."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 
-from sehdr_warp.rasterizer.projection import ProjectedGaussians, RasterInputs, project_to_camera
+from sehdr_warp.rasterizer.projection import ProjectedGaussians, Splats, project_to_camera
 from sehdr_warp.rasterizer.render_options import RenderOptions
 from sehdr_warp.rasterizer.tile_lists import PackedSplats, pack_splats
 
@@ -64,19 +63,10 @@ def projected(scene: SplatInputs, threshold: float = 1 / 255) -> ProjectedGaussi
         return project_to_camera(*tensors, options)
 
 
-class PackedScene(NamedTuple):
-    """What build_tile_lists() takes of a scene."""
-
-    packed: PackedSplats
-    depths: torch.Tensor
-    extents: torch.Tensor
-
-
-def packed(scene: SplatInputs, threshold: float = 1 / 255) -> PackedScene:
+def packed(scene: SplatInputs, threshold: float = 1 / 255) -> PackedSplats:
     gaussians = projected(scene, threshold)
-    inputs = RasterInputs(gaussians, gaussians.means2d.new_empty(len(gaussians.means2d), 0))
-    packed = pack_splats(inputs, threshold, scene.width, scene.height)
-    return PackedScene(packed, gaussians.depths, gaussians.extents)
+    splats = Splats(*gaussians, gaussians.means2d.new_empty(len(gaussians.means2d), 0))
+    return pack_splats(splats, threshold, scene.width, scene.height)
 
 
 def relative_error(value: torch.Tensor, truth: torch.Tensor) -> float:

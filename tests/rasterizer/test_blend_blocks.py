@@ -11,6 +11,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer import blending, block_blending, tile_lists
 from sehdr_warp.rasterizer.blending import blend
 from sehdr_warp.rasterizer.block_blending import BlockBackward, blend_on_cuda
+from sehdr_warp.rasterizer.projection import Splats
 from sehdr_warp.rasterizer.reference import blend_reference
 from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_intersections
 
@@ -37,14 +38,11 @@ def blocks(monkeypatch):
 
 
 def leaves_and_lists(scene):
-    """What blend() takes: the leaves (means2d, conics, opacities, features), lists and packed Gaussians; and the
-    extents."""
-    means2d, conics, _, opacities, _ = projected(scene)
-    splats, depths, extents = packed(scene)
-    offsets = order_intersections(splats.counts, depths, extents)
-    lists = build_tile_lists(splats, offsets, depths, extents, scene.width, scene.height)
-    leaves = [tensor.detach().requires_grad_() for tensor in (means2d, conics, opacities, scene.tensors[4])]
-    return leaves, lists, splats, extents
+    """What blend() takes: splats whose tensors are leaves, lists and packed Gaussians."""
+    gaussians, splats = projected(scene), packed(scene)
+    lists = build_tile_lists(splats, order_intersections(splats), scene.width, scene.height)
+    leaves = [tensor.detach().requires_grad_() for tensor in (*gaussians, scene.tensors[4])]
+    return Splats(*leaves), lists, splats
 
 
 def test_more_gradients_than_int32_counts_are_refused_in_a_fixed_order():
@@ -60,16 +58,15 @@ def test_more_gradients_than_int32_counts_are_refused_in_a_fixed_order():
 def test_block_kernels_match_the_reference(blocks, dtype, channels, deterministic):
     # Enough overlap that queues spill over 32 and pixels finish early; a cut tile at the right and the bottom.
     scene = random_scene(count=600, channels=channels, width=44, height=26, spread=1.6, seed=2)
-    leaves, lists, splats, _ = leaves_and_lists(scene.to(dtype))
+    leaves, lists, splats = leaves_and_lists(scene.to(dtype))
     ranges = lists.tile_ranges
     assert int((ranges[:, 1] - ranges[:, 0]).max()) > 64
-    image, transmittance = blocks(lambda: blend(*leaves, lists, splats, THRESHOLD, deterministic))
+    image, transmittance = blocks(lambda: blend(leaves, lists, splats, THRESHOLD, deterministic))
     truth = scene.to(torch.float64)
-    true_leaves, _, _, true_extents = leaves_and_lists(truth)
-    depths_extents = projected(truth)[2], true_extents
-    true_image, true_transmittance = blend_reference(
-        *[*true_leaves, *depths_extents], truth.width, truth.height, THRESHOLD
-    )
+    true_leaves, _, _ = leaves_and_lists(truth)
+    means2d, conics, depths, opacities, extents, features = true_leaves
+    blended = means2d, conics, opacities, features, depths.detach(), extents.detach()
+    true_image, true_transmittance = blend_reference(*blended, truth.width, truth.height, THRESHOLD)
     assert (true_transmittance < 0.001).any()
     assert relative_error(image, true_image) < BOUNDS[dtype]
     assert relative_error(transmittance, true_transmittance) < BOUNDS[dtype]
@@ -78,25 +75,26 @@ def test_block_kernels_match_the_reference(blocks, dtype, channels, deterministi
     blocks(loss.backward)
     true_loss = (true_transmittance * random_like(true_transmittance, 2)).sum()
     (true_loss + (true_image * random_like(true_image, 1)).sum()).backward()
-    for ours, true in zip(leaves, true_leaves):
-        assert relative_error(ours.grad, true.grad) < BOUNDS[dtype]
+    for name in ("means2d", "conics", "opacities", "features"):
+        ours, true = getattr(leaves, name).grad, getattr(true_leaves, name).grad
+        assert relative_error(ours, true) < BOUNDS[dtype]
 
 
 def test_a_single_pixels_gradient_may_have_any_strides(blocks):
     scene = random_scene(count=600, channels=1, width=1, height=1, spread=1.6, seed=2).to(torch.float32, "cpu")
-    leaves, lists, splats, _ = leaves_and_lists(scene)
-    image = blocks(lambda: blend(*leaves, lists, splats, THRESHOLD))[0]
+    leaves, lists, splats = leaves_and_lists(scene)
+    image = blocks(lambda: blend(leaves, lists, splats, THRESHOLD))[0]
     blocks(image.sum().backward)
-    assert float(leaves[3].grad.sum()) > 0
+    assert float(leaves.features.grad.sum()) > 0
 
 
 def test_nothing_more_by_gaussian_is_kept_for_the_backward_pass(blocks, monkeypatch):
     monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
     monkeypatch.setattr(block_blending, "MAX_SINGLE_SORT", 0)  # few are kept padded
     scene = random_scene(count=600, channels=3, width=44, height=26, seed=2).to(torch.float32, "cpu")
-    leaves, lists, splats, _ = leaves_and_lists(scene)
+    leaves, lists, splats = leaves_and_lists(scene)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
-        image = blocks(lambda: blend(*leaves, lists, splats, THRESHOLD))[0]
+        image = blocks(lambda: blend(leaves, lists, splats, THRESHOLD))[0]
     allocated = sum(event.nbytes() for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]")
     by_pixel = 3 + 1 + 1  # image, transmittance and the last Gaussian drawn
     assert image.requires_grad and allocated == 4 * by_pixel * 44 * 26

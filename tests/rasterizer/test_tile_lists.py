@@ -30,69 +30,66 @@ def dense(device, count=20000):
 
 
 def counted(*scene):
-    """What emit_intersections() reads, and the counts in that order."""
-    splats, depths, extents = dense(*scene)
-    order = depth_order(depths, extents)
-    return (order, splats, depths, extents), splats.counts[order]
+    """The order of the Gaussians, the packed ones, and the counts in that order."""
+    splats = dense(*scene)
+    order = depth_order(splats.depths, splats.extents)
+    return order, splats, splats.counts[order]
 
 
-def built(splats, depths, extents, max_intersections=None, *, keep_emit_order=True):
-    offsets = order_intersections(splats.counts, depths, extents, keep_emit_order=keep_emit_order)
-    size = 16 * GRID.columns, 16 * GRID.rows
-    return build_tile_lists(splats, offsets, depths, extents, *size, max_intersections)
+def built(splats, max_intersections=None, *, keep_emit_order=True):
+    offsets = order_intersections(splats, keep_emit_order=keep_emit_order)
+    return build_tile_lists(splats, offsets, 16 * GRID.columns, 16 * GRID.rows, max_intersections)
 
 
-def emit(arguments, counts, monkeypatch):
+def emit(order, splats, counts, monkeypatch):
     """Tiles and Gaussians of the intersections, in memory that holds what no tile and no Gaussian is."""
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
     capacity = int(counts.sum())
-    order, splats, *others = arguments
     offsets = IntersectionOffsets(order, counts.cumsum(0), False)
-    tiles, gaussians = emit_intersections(splats, offsets, *others, GRID, capacity)
+    tiles, gaussians = emit_intersections(splats, offsets, GRID, capacity)
     monkeypatch.undo()
     return tiles[:capacity], gaussians[:capacity]
 
 
 def test_each_counted_tile_is_emitted_once(device, monkeypatch):
-    arguments, counts = counted(device)
+    order, splats, counts = counted(device)
     assert int(counts.sum()) > 200_000
-    tiles, gaussians = emit(arguments, counts, monkeypatch)
+    tiles, gaussians = emit(order, splats, counts, monkeypatch)
     assert int(tiles.min()) >= 0 and int(tiles.max()) < GRID.tiles
-    assert torch.equal(gaussians, arguments[0].repeat_interleave(counts))
+    assert torch.equal(gaussians, order.repeat_interleave(counts))
     pairs = gaussians.long() * GRID.tiles + tiles
     assert len(pairs.unique()) == len(pairs)
 
 
 def test_an_intersection_counted_too_much_has_no_tile_and_one_too_few_costs_its_own_gaussian_only(device, monkeypatch):
-    arguments, counts = counted(device, 500)
-    true_tiles, _ = emit(arguments, counts, monkeypatch)
+    order, splats, counts = counted(device, 500)
+    true_tiles, _ = emit(order, splats, counts, monkeypatch)
     first, second = counts.nonzero()[[3, 40], 0].tolist()
     assert int(counts[second]) > 1
     wrong = counts.clone()
     wrong[first] += 2
     wrong[second] -= 1
-    tiles, gaussians = emit(arguments, wrong, monkeypatch)
-    assert torch.equal(gaussians, arguments[0].repeat_interleave(wrong))
+    tiles, gaussians = emit(order, splats, wrong, monkeypatch)
+    assert torch.equal(gaussians, order.repeat_interleave(wrong))
     unused = tiles == GRID.tiles
-    assert int(unused.sum()) == 2 and set(gaussians[unused].tolist()) == {int(arguments[0][first])}
+    assert int(unused.sum()) == 2 and set(gaussians[unused].tolist()) == {int(order[first])}
     dropped = int(counts[: second + 1].sum()) - 1
     assert torch.equal(tiles[~unused], torch.cat([true_tiles[:dropped], true_tiles[dropped + 1 :]]))
     ordered = tiles.sort(stable=True)
-    ranges, _ = find_tile_ranges(ordered.values, gaussians[ordered.indices], arguments[1], GRID)
+    ranges, _ = find_tile_ranges(ordered.values, gaussians[ordered.indices], splats, GRID)
     assert int((ranges[:, 1] - ranges[:, 0]).sum()) == len(tiles) - 2
 
 
 @pytest.mark.parametrize("spare", [0, 7, -1000])
 def test_one_sort_makes_the_lists_of_two(device, spare):
-    splats, depths, extents = dense(device)
-    counts = splats.counts
+    splats = dense(device)
     # Many at one depth: ties keep the order of indices.
-    depths = (depths * 4).round().clamp_min(1) / 4
-    lists = built(splats, depths, extents)
+    splats = splats._replace(depths=(splats.depths * 4).round().clamp_min(1) / 4)
+    lists = built(splats)
     capacity = lists.intersection_count + spare
-    offsets = IntersectionOffsets(None, counts.cumsum(0), False)
-    keys, gaussians = emit_intersections(splats, offsets, depths, extents, GRID, capacity)
+    offsets = IntersectionOffsets(None, splats.counts.cumsum(0), False)
+    keys, gaussians = emit_intersections(splats, offsets, GRID, capacity)
     sort_pairs(keys, gaussians, capacity, DEPTH_BITS + GRID.tiles.bit_length())
     keys, gaussians = keys[:capacity], gaussians[:capacity]
     ranges, corners = find_tile_ranges(keys, gaussians, splats, GRID)
@@ -107,9 +104,8 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
 def test_subtiles_are_those_that_an_ellipse_touches(device):
     """Beside what all pixels of a subtile see of a Gaussian, drawn alone."""
     scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)
-    splats, depths, extents = packed(scene)
-    offsets = order_intersections(splats.counts, depths, extents, keep_emit_order=False)
-    lists = build_tile_lists(splats, offsets, depths, extents, 32, 32)
+    splats = packed(scene)
+    lists = build_tile_lists(splats, order_intersections(splats, keep_emit_order=False), 32, 32)
     columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
     (x, y, *_), (a, b, c, cutoff) = (record[lists.gaussians.long()].t()[..., None, None] for record in splats[:2])
     dx, dy = columns + 0.5 - x, rows + 0.5 - y
@@ -130,9 +126,9 @@ def test_subtiles_are_those_that_an_ellipse_touches(device):
 def test_overflow_is_more_intersections_than_capacity(device, keep_emit_order, count):
     size = {"width": 16 * GRID.columns, "height": 16 * GRID.rows}
     scene = packed(random_scene(count=count, **size, seed=3).to(torch.float32, device))
-    intersections = built(*scene, keep_emit_order=keep_emit_order).intersection_count
+    intersections = built(scene, keep_emit_order=keep_emit_order).intersection_count
     for capacity in {max(1, intersections + spare) for spare in (-1, 0, 1)}:
-        lists = built(*scene, capacity, keep_emit_order=keep_emit_order)
+        lists = built(scene, capacity, keep_emit_order=keep_emit_order)
         assert bool(lists.overflow) == (intersections > capacity) and lists.total == intersections
 
 
@@ -148,8 +144,8 @@ def kept_bytes(holder):
 @pytest.mark.parametrize("keep_emit_order", [False, True])
 def test_lists_keep_no_more_memory_than_they_use(device, keep_emit_order, spare):
     scene = dense(device, 500)
-    exact = built(*scene, keep_emit_order=keep_emit_order)
-    lists = exact if spare is None else built(*scene, exact.intersection_count + spare, keep_emit_order=keep_emit_order)
+    exact = built(scene, keep_emit_order=keep_emit_order)
+    lists = exact if spare is None else built(scene, exact.intersection_count + spare, keep_emit_order=keep_emit_order)
     intersections = exact.intersection_count + (spare or 0)
     assert torch.equal(lists.gaussians[: exact.intersection_count], exact.gaussians)
     total_and_overflow = 8 + (spare is not None)
@@ -169,7 +165,7 @@ def test_intersections_counted_by_chunks_are_those_sorted(monkeypatch, count, ch
     # Some belong to no tile, and some tiles have none.
     tile_keys = [torch.randint(3, grid.tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
     tile_keys.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
-    splats = PackedSplats(torch.zeros(1000, 4), torch.full((1000, 4), -1.0), torch.zeros(1000, dtype=torch.int64))
+    splats = PackedSplats(torch.zeros(1000, 4), torch.full((1000, 4), -1.0), None, None, None)
     counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in tile_keys), count, None, grid, keep_emit_order)
     copies = (tensor.clone() for tensor in tile_keys)
     ranges, ones, corners, places = tile_lists._sort_by_tile(*tile_keys, count, splats, grid, keep_emit_order)

@@ -25,7 +25,7 @@ from torch import Tensor
 from torch._C._dynamo.guards import TensorGuards
 
 from ..blending import BlendResult
-from ..projection import RasterTensors, with_projection_gradient
+from ..projection import RasterTensors, Splats, with_projection_gradient
 from ..render_options import RenderOptions
 from ..tile_lists import MAX_SINGLE_SORT
 from ..warp_launch.launching import stream_handle
@@ -173,9 +173,9 @@ class GraphInUse:
         means2d, conics_opacities, depths, extents = outputs
         return ReplayedRender(self, blended, means2d, depths, extents, conics_opacities)
 
-    def render_projected(self, tensors: Sequence[Tensor], extents: Tensor) -> BlendResult:
-        """Render from flatten() of RasterInputs; write the extents that are left, see pack_splats()."""
-        image, transmittance, _, self._prepared = self._graph.replay(tensors, (extents,))
+    def render_projected(self, splats: Splats) -> BlendResult:
+        """Render; write the extents that are left, see pack_splats()."""
+        image, transmittance, _, self._prepared = self._graph.replay(splats, (splats.extents,))
         return BlendResult(image, transmittance, self.blend_backward)
 
     def count_intersections(self) -> int | None:
@@ -237,12 +237,10 @@ class GraphPool:
     idle: list[CapturedRender] = field(default_factory=list)
     last_use: int = 0
 
-    def begin_render(self, tensors: Sequence[Tensor], options: RenderOptions) -> GraphInUse | None:
-        """Return a CUDA graph for one render, or None if the call is to be launched instead.
+    def begin_render(self, tensors: RasterTensors | Splats, options: RenderOptions) -> GraphInUse | None:
+        """Return a CUDA graph for one render, from Splats if they are projected already.
 
-        Args:
-            tensors: RasterTensors, or flatten() of RasterInputs for a render of 2D Gaussians.
-            options: of the image.
+        None if the call is to be launched instead.
         """
         try:
             graph = self.idle.pop()
@@ -250,7 +248,7 @@ class GraphPool:
             graph = self._capture(tensors, options)
         return None if graph is None else GraphInUse(self, graph)
 
-    def _capture(self, tensors: Sequence[Tensor], options: RenderOptions) -> CapturedRender | None:
+    def _capture(self, tensors: RasterTensors | Splats, options: RenderOptions) -> CapturedRender | None:
         self.launched += 1
         if self.launched <= WARMUP_CALLS or self.captured >= self.max_graphs:
             return None

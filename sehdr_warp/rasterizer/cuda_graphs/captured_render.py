@@ -13,7 +13,7 @@ from torch import Tensor
 from ...kernels.caller_memory import write_last
 from ...kernels.project import projection_kernel
 from ..block_blending import BlockBackward, blend_on_cuda, fixed_blend_blocks
-from ..projection import ProjectedGaussians, RasterInputs, RasterTensors, project_to_camera, projection_parameters
+from ..projection import ProjectedGaussians, RasterTensors, Splats, project_to_camera, projection_parameters
 from ..render_options import MAX_INTERSECTIONS, RenderOptions
 from ..tile_lists import (
     MAX_SINGLE_SORT,
@@ -63,7 +63,7 @@ class CapturedRender:
     before and after the graph.
 
     Args:
-        tensors: RasterTensors, or flatten() of RasterInputs for a render of 2D Gaussians.
+        tensors: RasterTensors, or Splats for a render of 2D Gaussians.
         options: of the image.
         intersections: the least number to allocate memory for.
         differentiable: whether gradients by the tensors that require them are needed.
@@ -74,7 +74,7 @@ class CapturedRender:
     """
 
     def __init__(
-        self, tensors: Sequence[Tensor], options: RenderOptions, intersections: int, differentiable: bool
+        self, tensors: RasterTensors | Splats, options: RenderOptions, intersections: int, differentiable: bool
     ) -> None:
         """Launch the render once, then capture it."""
         projects, many = isinstance(tensors, RasterTensors), len(tensors[0]) > MAX_COPIED_GAUSSIANS
@@ -84,8 +84,7 @@ class CapturedRender:
         if self._copies:
             self._inputs = [tensor.clone() for tensor in self._inputs]
         self._to_project = RasterTensors(*self._inputs) if projects else None
-        first, features = self._inputs[0], tensors.features if isinstance(tensors, RasterTensors) else tensors[-1]
-        channels = features.shape[1] + (options.depth and projects)
+        first, channels = self._inputs[0], tensors.features.shape[1] + (options.depth and projects)
         self._image = first.new_empty(options.height, options.width, channels)
         self._transmittance = first.new_empty(options.height, options.width)
         self._counter = torch.empty(1, dtype=torch.int64, device="cpu", pin_memory=True)
@@ -97,10 +96,10 @@ class CapturedRender:
         # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
         splats, packed = self._project_and_pack()
         with self._runner.on_capture_stream():
-            offsets = self._order_and_count(splats, packed)
+            offsets = self._order_and_count(packed)
             limit = int(HEADROOM * max(intersections, int(offsets.cumulative_counts[-1])))
             self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
-            layout = self._layout_for(tensors, self._blend(splats, packed, self._list(splats, packed, offsets)))
+            layout = self._layout_for(tensors, self._blend(splats, packed, self._list(packed, offsets)))
             # With more Gaussians memory is worth more than the host's time.
             self._gradients = layout.like if differentiable and not many else None
             if self._copies:
@@ -112,71 +111,66 @@ class CapturedRender:
             splats, blend = self._runner.capture(None, self._render)
             if differentiable:
                 gaussians = () if self._to_project is None else self._to_project.of_projection
-                self.backward = CapturedBackward(layout, blend, gaussians, options, splats.projected)
+                projected = ProjectedGaussians(*splats[:-1])
+                self.backward = CapturedBackward(layout, blend, gaussians, options, projected)
         else:
-            lists = self._runner.capture(
-                None, lambda: self._list(splats, packed, self._order_and_count(splats, packed))
-            )
+            lists = self._runner.capture(None, lambda: self._list(packed, self._order_and_count(packed)))
             self._fix_launches(splats, packed, lists)
         self._results = [*([self._image, self._transmittance] if self._copies else ()), *self._projection_of(splats)]
         if not self._copies:
             self._inputs, self._to_project = [], None  # The caller's.
 
-    def _render(self) -> tuple[RasterInputs, BlockBackward]:
+    def _render(self) -> tuple[Splats, BlockBackward]:
         """Run all stages, which the methods below are, in their order."""
         self._callers.read(self._inputs)
         splats, packed = self._project_and_pack()
-        lists = self._list(splats, packed, self._order_and_count(splats, packed))
+        lists = self._list(packed, self._order_and_count(packed))
         backward = self._blend(splats, packed, lists)
         self._write(splats)
         return splats, backward
 
-    def _project_and_pack(self) -> tuple[RasterInputs, PackedSplats]:
+    def _project_and_pack(self) -> tuple[Splats, PackedSplats]:
         options = self._options
-        splats = unflatten(self._inputs) if self._to_project is None else _project(self._to_project, options)
+        splats = Splats(*self._inputs) if self._to_project is None else _project(self._to_project, options)
         pads = not self._copies or self._image.shape[2] % 4 > 0
         return splats, pack_splats(splats, options.alpha_threshold, options.width, options.height, pads=pads)
 
-    def _order_and_count(self, splats: RasterInputs, packed: PackedSplats) -> IntersectionOffsets:
-        _, _, depths, _, extents = splats.projected
-        offsets = order_intersections(packed.counts, depths, extents, keep_emit_order=False)
+    def _order_and_count(self, packed: PackedSplats) -> IntersectionOffsets:
+        offsets = order_intersections(packed, keep_emit_order=False)
         launch(write_last, 1, offsets.cumulative_counts, self._counter)  # What follows waits longer for a copy.
         return offsets
 
-    def _list(self, splats: RasterInputs, packed: PackedSplats, offsets: IntersectionOffsets) -> TileLists:
-        (_, _, depths, _, extents), options = splats.projected, self._options
-        size = options.width, options.height
-        return build_tile_lists(packed, offsets, depths, extents, *size, self.max_intersections)
+    def _list(self, packed: PackedSplats, offsets: IntersectionOffsets) -> TileLists:
+        return build_tile_lists(packed, offsets, self._options.width, self._options.height, self.max_intersections)
 
-    def _blend(self, splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> BlockBackward:
+    def _blend(self, splats: Splats, packed: PackedSplats, lists: TileLists) -> BlockBackward:
         outputs, threshold = (self._image, self._transmittance), self._options.alpha_threshold
         return blend_on_cuda(splats.features, lists, packed, *outputs, threshold, False, keeps_padded=True)
 
-    def _write(self, splats: RasterInputs) -> None:
+    def _write(self, splats: Splats) -> None:
         zeros = 0 if self._gradients is None else self._gradients.numel()
         self._callers.write([self._image, self._transmittance, *self._projection_of(splats)], zeros)
 
-    def _projection_of(self, splats: RasterInputs) -> list[Tensor]:
+    def _projection_of(self, splats: Splats) -> list[Tensor]:
         """Return what a render returns beside image and transmittance."""
-        means2d, _, depths, _, extents = splats.projected
-        return [extents] if self._to_project is None else [means2d, depths, extents]
+        return [splats.extents] if self._to_project is None else [splats.means2d, splats.depths, splats.extents]
 
-    def _layout_for(self, tensors: Sequence[Tensor], blend: BlockBackward) -> GradientLayout:
+    def _layout_for(self, tensors: RasterTensors | Splats, blend: BlockBackward) -> GradientLayout:
         """Return the layout of the gradients that these tensors of a call require."""
         if self._to_project is None or not isinstance(tensors, RasterTensors):
-            return GradientLayout(blend, [], copies_features=_is_trained(tensors[-1]))
+            return GradientLayout(blend, [], copies_features=_is_trained(tensors.features))
         inputs = zip(tensors.of_projection, self._to_project.of_projection, strict=True)
         gaussians = [like if tensor.requires_grad else None for tensor, like in inputs]
         # Features with depths get their gradient through torch.cat().
         copies_features = _is_trained(tensors.features) and not self._options.depth
         return GradientLayout(blend, gaussians, copies_features=copies_features)
 
-    def _fix_launches(self, splats: RasterInputs, packed: PackedSplats, lists: TileLists) -> None:
+    def _fix_launches(self, splats: Splats, packed: PackedSplats, lists: TileLists) -> None:
         """Prepare the launches of _launch()."""
         assert packed.padded is not None and self._to_project is not None
         options, outputs = self._options, (self._image, self._transmittance)
         size = options.width, options.height
-        self._project = _fixed_projection(self._to_project, options, splats.projected)
+        self._project = _fixed_projection(self._to_project, options, ProjectedGaussians(*splats[:-1]))
         self._pack = fixed_pack_splats(splats, packed, options.alpha_threshold, *size)
         self._fixed_blend = fixed_blend_blocks(packed.padded, lists, packed, *outputs, options.alpha_threshold)
 
@@ -231,21 +225,11 @@ def _is_trained(tensor: Tensor) -> bool:
     return tensor.is_leaf and tensor.requires_grad
 
 
-def _project(tensors: RasterTensors, options: RenderOptions) -> RasterInputs:
+def _project(tensors: RasterTensors, options: RenderOptions) -> Splats:
     projected, features = project_to_camera(*tensors.of_projection, options=options), tensors.features
     if options.depth:
         features = torch.cat([features, projected.depths[:, None]], 1)
-    return RasterInputs(projected, features)
-
-
-def flatten(inputs: RasterInputs) -> tuple[Tensor, ...]:
-    """Return the six tensors of RasterInputs."""
-    return *inputs.projected, inputs.features
-
-
-def unflatten(tensors: Sequence[Tensor]) -> RasterInputs:
-    """Return the RasterInputs of flatten()."""
-    return RasterInputs(ProjectedGaussians(*tensors[:-1]), tensors[-1])
+    return Splats(*projected, features)
 
 
 def _fixed_projection(tensors: RasterTensors, options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
