@@ -70,7 +70,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
 
     The kernel's arguments beside those of blend_cuda.forward_kernel():
         grad_image: [H W] vectors of C.
-        grad_transmittance: [H W], or [0] for 0.
+        grad_transmittance: [H W], or None for 0.
         lines: LINES; an argument, as the next, so that its loop stays a loop.
         gradient_count: C + 6.
         only_subtile: of an ordered launch; otherwise not read.

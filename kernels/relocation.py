@@ -102,9 +102,9 @@ def copy_rows(
     values_a: _rows, values_b: _rows, values_c: _rows, values_d: _rows, values_e: _rows, values_f: _rows,
     changed: wp.array(dtype=wp.bool),
 ):
-    """Fill rows whose slot is begin[0] + k, below end[0], with source row k or, unless it is empty, sampled_rows[k].
+    """Fill rows whose slot is begin[0] + k, below end[0], with source row k or, unless it is None, sampled_rows[k].
 
-    With sampled_rows nothing is filled if total[0] is 0. Filled rows are marked in changed, unless it is empty. Sources
+    With sampled_rows nothing is filled if total[0] is 0. Filled rows are marked in changed, unless it is None. Sources
     may be the values themselves if no row is both read and written. One thread for each row.
     """
     row = range_start + wp.tid()

@@ -34,9 +34,8 @@ def decide_step(
     """Decide whether a step is skipped: if its loss or a gradient is not finite, or on overflow. One thread.
 
     step_flags: [2], 1 or 0: skipped, applied. finiteness: [K], not all finite if a gradient is not. overflow: [1],
-    whether there were more intersections than memory, or [0] if there cannot be. step_counters: [3] or [0], counts
-    steps that are not finite and, with intersections ([1] or [0]), holds the most intersections and counts the steps
-    with overflow.
+    whether there were more intersections than memory, or None. step_counters: [3] or None, counts steps that are not
+    finite and, with intersections ([1] or None), holds the most intersections and counts the steps with overflow.
     """
     finite = wp.isfinite(loss[0])
     for i in range(finiteness.shape[0]):

@@ -114,6 +114,93 @@ class Render:
     film: FilmOptions = FilmOptions()
 
 
+def run_render(args: Render) -> None:
+    """Run `sehdr-warp render`."""
+    from .film import write_film
+    from .render_views import reframe, render_views, select_cameras
+    from .world_transform import world_transform
+
+    ramp, size = _check_render(args)
+    run = open_scene(args.run, args.device)
+    default_count = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
+    count = default_count if args.count is None else args.count
+    selection, files, summary = {"cameras": args.cameras, "camera": args.camera, "count": count}, [], ""
+    fps = args.film.fps
+    if args.out is not None:
+        groups = vars(args.world) | vars(args.pictures)  # Their fields are arguments of render_views().
+        files = render_views(run, args.out, size=size, overwrite=args.overwrite, fps=fps, **selection, **groups)
+        summary = f"{args.out}: {len(files)} files"
+    if args.video is not None:
+        transform = world_transform(run, **vars(args.world))
+        cameras = [camera for _, camera in select_cameras(run, **selection, transform=transform, up=args.world.up)]
+        if size is not None:
+            cameras = [reframe(camera, *size) for camera in cameras]
+        film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}
+        files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
+        if len(cameras) == 1:
+            log.warning("%s: '%s' is one camera, so one frame; --cameras orbit is a path", args.video, args.cameras)
+        seconds = len(cameras) / fps
+        summary = summary or f"{args.video}: {len(cameras)} frame{'s' * (len(cameras) > 1)}, {seconds:.3g} s"
+    print(json.dumps({"files": [str(path) for path in files]}) if args.json else summary)
+
+
+def _check_render(args: Render) -> tuple[tuple[float, float], tuple[int, int] | None]:
+    """Check the options before a scene is loaded, which takes seconds; return the ramp of stops and the size.
+
+    Raises UsageError or SehdrError for options that do not fit each other or are out of range.
+    """
+    from .aovs import read_aovs
+    from .film import check_rate, film_format, film_library
+    from .images.colorspace import color_space
+    from .render_views import PATHS, check_bracket_options, check_cameras, may_move, read_size
+
+    pictures = args.pictures
+    color_space(pictures.colorspace)
+    if args.out is None and args.video is None:
+        problem = "render needs --out, a folder for the pictures, or --video, a film"
+        raise UsageError(f"{problem}; see sehdr-warp render --help")
+    flags = changed_flags(args.film)
+    if args.out is not None and may_move(args.cameras):
+        flags = [flag for flag in flags if flag != "--fps"]  # Files of a moving camera state it, too.
+    if args.video is None and flags:
+        raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
+    if args.out is None and (flags := changed_flags(pictures)):
+        raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
+    check_cameras(args.cameras)
+    if args.count is not None and args.cameras not in PATHS:
+        raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
+    ramp = _ramp(args.film.ev_ramp)
+    check_rate(args.film.fps)
+    if pictures.aovs:
+        read_aovs(pictures.aovs)
+    brackets = {"multipart": pictures.multipart, "ldr_brackets": pictures.ldr_brackets, "group_by": pictures.group_by}
+    check_bracket_options(pictures.evs is not None or pictures.exposures is not None, **brackets)
+    size = None if args.size is None else read_size(args.size)
+    if args.video is not None:
+        film_library()
+        film_format(args.video)
+        check_absent(args.video, args.overwrite)
+    return ramp, size
+
+
+def _ramp(text: str | None) -> tuple[float, float]:
+    """Return the stops of --ev-ramp, which is one number or two with a colon between."""
+    if text is None:
+        return 0.0, 0.0
+    with suppress(ValueError):
+        stops = [float(part) for part in text.split(":")]
+        if len(stops) in (1, 2) and all(abs(stop) <= _MOST_STOPS for stop in stops):
+            return stops[0], stops[-1]
+    problem = f"is not stops from -{_MOST_STOPS} to {_MOST_STOPS}, with a colon between"
+    raise InputError(f"--ev-ramp {text}", problem, "write for example --ev-ramp=-4:4")
+
+
+def changed_flags(options: Any) -> list[str]:
+    """Return the flags of a dataclass of options whose values are not the default."""
+    names = [each.name for each in fields(options) if getattr(options, each.name) != each.default]
+    return ["--" + name.replace("_", "-") for name in names]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Report:
     """Write report.html: figures, photo, scene and truth side by side, brackets, where it fails; and pictures."""
@@ -128,6 +215,19 @@ class Report:
     """Replace files that exist."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+def run_report(args: Report) -> None:
+    """Run `sehdr-warp report`."""
+    from ..evaluation.evaluate import evaluate
+    from .report.write import check_report_folder, write_report
+
+    check_absent(args.out / "report.html", args.overwrite)
+    check_report_folder(args.out)
+    run = open_run(args.run, args.device)
+    scene = load_run_scene_with_confidence(run, args.data)
+    for path in write_report(run, scene, args.out, overwrite=args.overwrite, evaluation=evaluate(run, scene)):
+        print(path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +266,20 @@ class EnvironmentMap:
     """cpu or cuda:N; by default the first GPU if there is one."""
 
 
+def run_environment_map(args: EnvironmentMap) -> None:
+    """Run `sehdr-warp envmap`."""
+    from .images.colorspace import color_space
+    from .lighting.map_center import check_place
+
+    color_space(args.colorspace)  # Before anything is loaded
+    check_place(args.at)
+    from .lighting.environment_map import check_map, write_environment_map
+
+    check_map(args.out, args.size, args.layout, args.world.axes, args.beyond, args.pixel)
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
+    print(write_environment_map(open_scene(args.run, args.device), args.out, **options, **vars(args.world)))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Lights:
     """List the lights that the photos clipped, with place, size, radiance and its deviation; and write them as lights.
@@ -190,6 +304,28 @@ class Lights:
     """Replace files that exist."""
     device: str | None = None
     """cpu or cuda:N; by default the first GPU if there is one."""
+
+
+def run_lights(args: Lights) -> None:
+    """Run `sehdr-warp lights`."""
+    from .lighting.lights import lights_table, write_lights
+    from .lighting.map_center import check_place
+    from .lighting.unit import luminance_of_one
+    from .world_transform import world_transform
+
+    if args.out is None:
+        of_files = "--reference-white", "--at", "--beyond", "--unseen"
+        if flags := [flag for flag in changed_flags(args) if flag in of_files]:
+            raise UsageError(f"{', '.join(flags)}: set for a file, which --out names")
+        run = open_run(args.run, args.device)
+        transform = world_transform(run, **vars(args.world))
+        print(lights_table(run.find_lights(), luminance_of_one(run), transform))
+        return
+    check_place(args.at)
+    run = open_run(args.run, args.device)
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
+    for path in write_lights(run, args.out, **options, **vars(args.world)):
+        print(path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,135 +369,3 @@ def run_meter(args: Meter) -> None:
         raise UsageError(f"--pixel {args.pixel}: is not two numbers; write for example --pixel 812,440")
     reading = {"luminance": args.luminance, "illuminance": args.illuminance, "reflectance": args.reflectance}
     print(meter(run, args.view, (x, rest[0]), **reading))
-
-
-def run_lights(args: Lights) -> None:
-    """Run `sehdr-warp lights`."""
-    from .lighting.lights import lights_table, write_lights
-    from .lighting.map_center import check_place
-    from .lighting.unit import luminance_of_one
-    from .world_transform import world_transform
-
-    if args.out is None:
-        of_files = "--reference-white", "--at", "--beyond", "--unseen"
-        if flags := [flag for flag in changed_flags(args) if flag in of_files]:
-            raise UsageError(f"{', '.join(flags)}: set for a file, which --out names")
-        run = open_run(args.run, args.device)
-        transform = world_transform(run, **vars(args.world))
-        print(lights_table(run.find_lights(), luminance_of_one(run), transform))
-        return
-    check_place(args.at)
-    run = open_run(args.run, args.device)
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
-    for path in write_lights(run, args.out, **options, **vars(args.world)):
-        print(path)
-
-
-def run_environment_map(args: EnvironmentMap) -> None:
-    """Run `sehdr-warp envmap`."""
-    from .images.colorspace import color_space
-    from .lighting.map_center import check_place
-
-    color_space(args.colorspace)  # Before anything is loaded
-    check_place(args.at)
-    from .lighting.environment_map import check_map, write_environment_map
-
-    check_map(args.out, args.size, args.layout, args.world.axes, args.beyond, args.pixel)
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
-    print(write_environment_map(open_scene(args.run, args.device), args.out, **options, **vars(args.world)))
-
-
-def run_render(args: Render) -> None:
-    """Run `sehdr-warp render`."""
-    from .images.colorspace import color_space
-
-    color_space(args.pictures.colorspace)  # Before anything is loaded
-    from .aovs import read_aovs
-    from .film import check_rate, film_format, film_library, write_film
-    from .render_views import (
-        PATHS,
-        check_bracket_options,
-        check_cameras,
-        may_move,
-        read_size,
-        reframe,
-        render_views,
-        select_cameras,
-    )
-    from .world_transform import world_transform
-
-    if args.out is None and args.video is None:
-        problem = "render needs --out, a folder for the pictures, or --video, a film"
-        raise UsageError(f"{problem}; see sehdr-warp render --help")
-    flags = changed_flags(args.film)
-    if args.out is not None and may_move(args.cameras):
-        flags = [flag for flag in flags if flag != "--fps"]  # Files of a moving camera state it, too.
-    if args.video is None and flags:
-        raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
-    if args.out is None and (flags := changed_flags(args.pictures)):
-        raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
-    check_cameras(args.cameras)
-    if args.count is not None and args.cameras not in PATHS:
-        raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
-    ramp, fps = _ramp(args.film.ev_ramp), args.film.fps
-    check_rate(fps)
-    if (pictures := args.pictures).aovs:
-        read_aovs(pictures.aovs)
-    brackets = {"multipart": pictures.multipart, "ldr_brackets": pictures.ldr_brackets, "group_by": pictures.group_by}
-    check_bracket_options(pictures.evs is not None or pictures.exposures is not None, **brackets)
-    size = None if args.size is None else read_size(args.size)
-    if args.video is not None:
-        film_library()
-        film_format(args.video)
-        check_absent(args.video, args.overwrite)
-    run = open_scene(args.run, args.device)
-    default_count = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
-    count = default_count if args.count is None else args.count
-    selection, files, summary = {"cameras": args.cameras, "camera": args.camera, "count": count}, [], ""
-    if args.out is not None:
-        groups = vars(args.world) | vars(args.pictures)  # Their fields are arguments of render_views().
-        files = render_views(run, args.out, size=size, overwrite=args.overwrite, fps=fps, **selection, **groups)
-        summary = f"{args.out}: {len(files)} files"
-    if args.video is not None:
-        transform = world_transform(run, **vars(args.world))
-        cameras = [camera for _, camera in select_cameras(run, **selection, transform=transform, up=args.world.up)]
-        if size is not None:
-            cameras = [reframe(camera, *size) for camera in cameras]
-        film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}
-        files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
-        if len(cameras) == 1:
-            log.warning("%s: '%s' is one camera, so one frame; --cameras orbit is a path", args.video, args.cameras)
-        seconds = len(cameras) / fps
-        summary = summary or f"{args.video}: {len(cameras)} frame{'s' * (len(cameras) > 1)}, {seconds:.3g} s"
-    print(json.dumps({"files": [str(path) for path in files]}) if args.json else summary)
-
-
-def _ramp(text: str | None) -> tuple[float, float]:
-    """Return the stops of --ev-ramp, which is one number or two with a colon between."""
-    if text is None:
-        return 0.0, 0.0
-    with suppress(ValueError):
-        stops = [float(part) for part in text.split(":")]
-        if len(stops) in (1, 2) and all(abs(stop) <= _MOST_STOPS for stop in stops):
-            return stops[0], stops[-1]
-    problem = f"is not stops from -{_MOST_STOPS} to {_MOST_STOPS}, with a colon between"
-    raise InputError(f"--ev-ramp {text}", problem, "write for example --ev-ramp=-4:4")
-
-
-def run_report(args: Report) -> None:
-    """Run `sehdr-warp report`."""
-    from ..evaluation.evaluate import evaluate
-    from .report.write import check_report_folder, write_report
-
-    check_absent(args.out / "report.html", args.overwrite)
-    check_report_folder(args.out)
-    run = open_run(args.run, args.device)
-    scene = load_run_scene_with_confidence(run, args.data)
-    for path in write_report(run, scene, args.out, overwrite=args.overwrite, evaluation=evaluate(run, scene)):
-        print(path)
-
-
-def changed_flags(options: Any) -> list[str]:
-    """Return the flags of a dataclass of options whose values are not the default."""
-    names = [each.name for each in fields(options) if getattr(options, each.name) != each.default]
-    return ["--" + name.replace("_", "-") for name in names]

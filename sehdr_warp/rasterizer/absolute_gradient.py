@@ -24,16 +24,9 @@ def watch_absolute_gradients(
     alpha_threshold: float,
     store: Callable[[Tensor], None],
 ) -> tuple[Tensor, Tensor]:
-    """Return image and transmittance, whose backward pass first computes the absolute gradients of the 2D means.
+    """Return image and transmittance of blend(); their backward pass first computes absolute gradients of the means.
 
-    Args:
-        image: [H, W, C] of blend().
-        transmittance: [H, W] of blend().
-        features: [N, C] that were blended.
-        lists: of the Gaussians, on the CPU with TileLists.emit_order.
-        packed: of the Gaussians.
-        alpha_threshold: as of blend().
-        store: called with [N, 2], the sums over pixels of |dL/dx| and |dL/dy|.
+    The other arguments are blend()'s. store: called with [N, 2], the sums over pixels of |dL/dx| and |dL/dy|.
     """
     return _Watch.apply(image, transmittance, features.detach(), lists, packed, alpha_threshold, store)
 

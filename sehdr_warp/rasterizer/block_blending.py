@@ -64,8 +64,6 @@ class BlockBackward:
 
     def __call__(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
         """Return the gradients by Gaussian."""
-        if grad_transmittance is None:
-            grad_transmittance = self.transmittance.view(-1)[:0]
         lists = self.lists
         if not self.deterministic:
             gradients = self._zeros()
@@ -125,7 +123,7 @@ class BlockBackward:
         scalar = warp_scalar(self.features.dtype)
         return blend_cuda_backward.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
 
-    def _arguments(self, grad_image: Tensor, grad_transmittance: Tensor) -> tuple:
+    def _arguments(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> tuple:
         inputs = _inputs(pad_features(self.features), self.lists, self.packed, self.transmittance, self.alpha_threshold)
         outputs_and_gradients = self.transmittance, self.last_contributor, grad_image, grad_transmittance
         return *inputs, *outputs_and_gradients, blend_cuda_backward.LINES, self.channels + 6

@@ -261,13 +261,8 @@ def render_projected(
 
     Sets the extents of Gaussians whose features are not finite to 0, in place.
 
-    Args:
-        projected: the Gaussians.
-        features: [N, C].
-        options: of the image.
-        replays: on a GPU, replay calls that repeat as CUDA graphs. Not for rasterize(), which replays projections, too.
-        store_absolute: called in the backward pass with the absolute gradients of the 2D means, [N, 2]; see
-            watch_absolute_gradients(). Such calls are always launched.
+    replays: on a GPU, replay calls that repeat as CUDA graphs. Not for rasterize(), which replays projections, too.
+    store_absolute: of watch_absolute_gradients(), for compat.gsplat. Such calls are always launched.
     """
     means2d, conics, depths, opacities, extents = projected
     if options.depth:

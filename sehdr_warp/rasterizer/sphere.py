@@ -1,7 +1,5 @@
 """Splats seen in any directions from one point: environment maps, as latitude and longitude or the faces of a cube."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -23,7 +21,7 @@ from .checks import (
 )
 from .memory import oom_context
 from .projection import launch_projection
-from .tile_lists import EmitOrder, check_intersection_count, depth_order, lists_by_tile, tile_grid
+from .tile_lists import EmitOrder, TileLists, check_intersection_count, depth_order, lists_by_tile, tile_grid
 from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import even_ranges
@@ -100,12 +98,15 @@ def rasterize_directions(
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[1])):
         gaussians = tuple(tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, position))
         parameters = near_plane, footprint, smoothing, alpha_threshold
-        splats = _project(gaussians, parameters, antialiased)
+        kernel = projection_kernel(warp_scalar(means.dtype), antialiased)
+        outputs = [means.new_empty(len(means), *shape) for shape in ((4,), (3,), (3,), (), ())]
+        splats = _SphereSplats(*launch_projection(kernel, gaussians, parameters, outputs))
         opacities = splats.opacities.masked_fill(~features.isfinite().all(1), 0)
         blended = splats.caps, splats.across, splats.along, opacities, features.contiguous()
         keep_emit_order = means.is_cpu and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in blended)
-        lists = _list_tiles(splats.caps.detach(), splats.distances, directions.contiguous(), keep_emit_order)
-        return _Blend.apply(*blended, lists, alpha_threshold)
+        directions = directions.contiguous()
+        lists = _list_tiles(splats.caps.detach(), splats.distances, directions, keep_emit_order)
+        return _Blend.apply(*blended, directions, lists, alpha_threshold)
 
 
 class _SphereSplats(NamedTuple):
@@ -126,26 +127,8 @@ class _SphereSplats(NamedTuple):
     distances: Tensor
 
 
-def _project(inputs: Sequence[Tensor], parameters: tuple, antialiased: bool) -> _SphereSplats:
-    means = inputs[0]
-    kernel = projection_kernel(warp_scalar(means.dtype), antialiased)
-    outputs = [means.new_empty(len(means), *shape) for shape in ((4,), (3,), (3,), (), ())]
-    return _SphereSplats(*launch_projection(kernel, inputs, parameters, outputs))
-
-
-@dataclass(frozen=True)
-class _Lists:
-    """Tile lists of an image of directions [H, W, 3]; otherwise as TileLists."""
-
-    directions: Tensor
-    columns: int
-    tile_ranges: Tensor
-    gaussians: Tensor
-    emit_order: EmitOrder | None
-
-
 @torch.no_grad()
-def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_order: bool) -> _Lists:
+def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_order: bool) -> TileLists:
     """List for each tile the Gaussians whose cap meets the tile's own, by distance."""
     count, (height, width) = len(caps), directions.shape[:2]
     grid = tile_grid(width, height)
@@ -163,20 +146,20 @@ def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_o
     launch(kernel, count * bool(length), *shared, starts, counts, tiles, gaussians, min_range=256)
     tile_ranges, gaussians, _, emit_indices = lists_by_tile(tiles, gaussians, length, None, grid, keep_emit_order)
     emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
-    return _Lists(directions, grid.columns, tile_ranges, gaussians, emit_order)
+    return TileLists(tile_ranges, gaussians, None, emit_order, width, height, None, cumulative_counts[-1:])
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, caps, across, along, opacities, features, lists: _Lists, alpha_threshold: float):
-        (height, width), (_, channels) = lists.directions.shape[:2], features.shape
+    def forward(ctx, caps, across, along, opacities, features, directions, lists: TileLists, alpha_threshold: float):
+        width, height, channels = lists.width, lists.height, features.shape[1]
         splats = tuple(tensor.detach() for tensor in (caps, across, along, opacities, features))
         image, transmittance = features.new_empty(height, width, channels), features.new_empty(height, width)
         ends = torch.empty(height, width, dtype=torch.int32, device=image.device)
-        ctx.sizes = lists.columns, width, height, alpha_threshold
+        ctx.sizes = lists.grid.columns, width, height, alpha_threshold
         ctx.kernels, ctx.lists = sphere_kernels(warp_scalar(features.dtype), channels), lists
         ctx.pixels = lists.tile_ranges.shape[0] * _PIXELS
-        ctx.inputs = lists.tile_ranges, lists.gaussians, lists.directions.view(-1, 3)
+        ctx.inputs = lists.tile_ranges, lists.gaussians, directions.view(-1, 3)
         arguments = *ctx.inputs, *splats, *ctx.sizes, image.view(-1, channels), transmittance, ends
         launch(ctx.kernels.blend, ctx.pixels, *arguments, min_range=_PIXELS)
         ctx.save_for_backward(caps, across, along, opacities, features, transmittance, ends)
@@ -198,7 +181,7 @@ class _Blend(torch.autograd.Function):
             gradients = emit_order.sum_by_gaussian(gradients)
         grad_axis, grad_across, grad_along, grad_opacity, grad_features = gradients.split((3, 3, 3, 1, channels), dim=1)
         grad_caps = torch.nn.functional.pad(grad_axis, (0, 1))
-        return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None
+        return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None, None
 
 
 def caps_of(directions: Tensor, side: int) -> Tensor:

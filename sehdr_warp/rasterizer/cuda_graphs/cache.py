@@ -60,12 +60,7 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
 
 
 def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "GraphPool | None":
-    """Return the CUDA graphs of calls like this one, an empty pool at first; None if the call cannot be captured.
-
-    Args:
-        tensors: as GraphPool.begin_render() takes them, of one device and dtype.
-        options: of the image.
-    """
+    """Return the CUDA graphs of calls like this one, an empty pool at first; None if the call cannot be captured."""
     first = tensors[0]
     if not on_gpu(first) or first.dtype != torch.float32:
         return None
@@ -124,15 +119,9 @@ def on_gpu(tensor: Tensor) -> bool:
 
 
 class ReplayedRender(NamedTuple):
-    """A render by a CUDA graph, of which all but `blended` are differentiable functions of the call's tensors.
+    """A render by a CUDA graph: `blended` without gradients, the others as functions of the call's tensors.
 
-    Attributes:
-        graph: of the render.
-        blended: image and transmittance.
-        means2d: [N, 2].
-        depths: [N].
-        extents: [N, 2].
-        conics_opacities: stands for both in the autograd graph, see CapturedBackward; None without gradients.
+    conics_opacities stands for both in the autograd graph, see CapturedBackward; None without gradients.
     """
 
     graph: "GraphInUse"
@@ -217,25 +206,15 @@ class GraphInUse:
 
 @dataclass
 class GraphPool:
-    """The CUDA graphs of calls with one CallPattern.
+    """The CUDA graphs of calls with one CallPattern."""
 
-    Attributes:
-        differentiable: whether the calls need backward passes.
-        max_graphs: how many there may be.
-        launched: calls that were launched.
-        captured: CUDA graphs that were captured since the memory last grew.
-        intersections: the least number that the next CUDA graph allocates memory for.
-        idle: CUDA graphs that no call holds.
-        last_use: number of the last call.
-    """
-
-    differentiable: bool = False
+    differentiable: bool = False  # Whether the calls need backward passes
     max_graphs: int = MAX_GRAPHS
-    launched: int = 0
-    captured: int = 0
-    intersections: int = 0
-    idle: list[CapturedRender] = field(default_factory=list)
-    last_use: int = 0
+    launched: int = 0  # Calls that were launched
+    captured: int = 0  # CUDA graphs that were captured since the memory last grew
+    intersections: int = 0  # The least number that the next CUDA graph allocates memory for
+    idle: list[CapturedRender] = field(default_factory=list)  # CUDA graphs that no call holds
+    last_use: int = 0  # Number of the last call
 
     def begin_render(self, tensors: RasterTensors | Splats, options: RenderOptions) -> GraphInUse | None:
         """Return a CUDA graph for one render, from Splats if they are projected already.

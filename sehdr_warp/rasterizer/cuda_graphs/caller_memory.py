@@ -16,9 +16,6 @@ class CallerMemory:
     The caller's addresses stand in a table in pinned memory, which the graph reads when it is replayed. Copies by torch
     before and after the graph would take a quarter of a call's host time. The table must not change until the graph
     has read it. This object keeps the graph's inputs alive: nothing else refers to those of a render without gradients.
-
-    Args:
-        device: of the graph.
     """
 
     def __init__(self, device: torch.device) -> None:

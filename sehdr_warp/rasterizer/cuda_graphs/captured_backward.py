@@ -83,12 +83,8 @@ class GradientLayout:
 class CapturedBackward:
     """The backward passes of blend and projection.
 
-    Args:
-        layout: of the gradients.
-        blend: of the captured render.
-        gaussians: inputs of the projection on the graph's memory; none if the graph begins with 2D Gaussians.
-        options: of the image.
-        projected: outputs of the projection on the graph's memory.
+    gaussians, projected: inputs and outputs of the projection on the graph's memory; no inputs if the graph begins with
+    2D Gaussians.
 
     Attributes:
         conics_opacities: a stand-in for both, without memory: an output of the projection and an input of the blend in

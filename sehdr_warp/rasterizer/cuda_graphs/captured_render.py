@@ -62,12 +62,6 @@ class CapturedRender:
     would take a sixth of the time: what reads inputs and what writes the image is then launched on the caller's memory,
     before and after the graph.
 
-    Args:
-        tensors: RasterTensors, or Splats for a render of 2D Gaussians.
-        options: of the image.
-        intersections: the least number to allocate memory for.
-        differentiable: whether gradients by the tensors that require them are needed.
-
     Attributes:
         max_intersections: that there is memory for.
         backward: the backward passes; None unless differentiable.
@@ -76,7 +70,10 @@ class CapturedRender:
     def __init__(
         self, tensors: RasterTensors | Splats, options: RenderOptions, intersections: int, differentiable: bool
     ) -> None:
-        """Launch the render once, then capture it."""
+        """Launch the render once, then capture it.
+
+        intersections: the least number to allocate memory for. differentiable: whether gradients are needed.
+        """
         projects, many = isinstance(tensors, RasterTensors), len(tensors[0]) > MAX_COPIED_GAUSSIANS
         self._options, self._are_contiguous = options, all(tensor.is_contiguous() for tensor in tensors)
         self._copies = differentiable or options.depth or not projects or not many

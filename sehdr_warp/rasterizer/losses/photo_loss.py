@@ -21,11 +21,7 @@ from .ssim import distance_terms
 
 @dataclass(frozen=True)
 class ClippedWeights:
-    """Weights of the parts of clipped_light_energy(), each at least 0.
-
-    smoothness: of squared differences to the mean of clipped neighbors. estimate: of the squared distance from an
-    estimate, in its deviations.
-    """
+    """Weights of the parts of clipped_light_energy(), each at least 0."""
 
     smoothness: float = 0.0
     estimate: float = 0.0

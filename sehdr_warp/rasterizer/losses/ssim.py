@@ -130,7 +130,11 @@ def _compare(a: Tensor, b: Tensor, weights: tuple[float, float] | None = None) -
         arguments = a.flatten(1), b.flatten(1), *(weights or (0.0, 0.0)), *results, derivatives
         _launch_patches("compare", a, weights, *arguments)
     else:
-        _compare_in_runs(a, b, weights, values, derivatives)
+        runs = _Runs(a, weights is not None)
+        moments, images = runs.view(runs.padded(4)), (runs.view(a), runs.view(b))
+        runs.launch(runs.kernels.blur_columns, images, [moments])
+        compared = *images, *(weights or (0.0, 0.0)), runs.view(values), runs.view(derivatives)
+        runs.launch(runs.kernels.compare, [moments], compared)
     return values, derivatives
 
 
@@ -144,7 +148,11 @@ def _gradient(
         arguments = *inputs, *(weights or (0.0, 0.0)), result.flatten(1)
         _launch_patches("gradient", a, weights, *arguments)
     else:
-        _gradient_in_runs(a, b, derivatives, scale, weights, slopes, result)
+        runs = _Runs(a, weights is not None)
+        blurred = runs.view(runs.padded(3))
+        runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred])
+        scaled = scale, None if slopes is None else runs.view(slopes), *(weights or (0.0, 0.0)), runs.view(result)
+        runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled)
     return result
 
 
@@ -153,23 +161,6 @@ def _launch_patches(name: str, image: Tensor, weights: tuple[float, float] | Non
     taps = constant(tuple(window()), image.dtype, image.device)
     _, width, channels = image.shape
     patches.launch_patches(kernel, image, taps, width, channels, *arguments)
-
-
-def _compare_in_runs(a, b, weights, similarity, derivatives) -> None:
-    runs = _Runs(a, weights is not None)
-    moments = runs.view(runs.padded(4))
-    images = runs.view(a), runs.view(b)
-    runs.launch(runs.kernels.blur_columns, images, [moments])
-    compared = *images, *(weights or (0.0, 0.0)), runs.view(similarity), runs.view(derivatives)
-    runs.launch(runs.kernels.compare, [moments], compared)
-
-
-def _gradient_in_runs(a, b, derivatives, scale, weights, slopes, result) -> None:
-    runs = _Runs(a, weights is not None)
-    blurred = runs.view(runs.padded(3))
-    runs.launch(runs.kernels.blur_derivatives, [runs.view(derivatives)], [blurred])
-    scaled = scale, None if slopes is None else runs.view(slopes), *(weights or (0.0, 0.0)), runs.view(result)
-    runs.launch(runs.kernels.gradient, [blurred, runs.view(a), runs.view(b)], scaled)
 
 
 class _Runs:

@@ -69,13 +69,10 @@ def copy_rows(
     and written. slots: [N] int32, negative for rows that stay. begin, end: int64 scalars. changed: [N] bool, marks
     filled rows.
     """
-    if samples is None:
-        samples = SampledRows(slots.new_empty(0, dtype=torch.int64), slots.new_empty(0, dtype=torch.float64))
-    marked = torch.empty(0, dtype=torch.bool, device=slots.device) if changed is None else changed
     for start in range(0, len(values), kernels.AT_ONCE):
         group = slice(start, start + kernels.AT_ONCE)
-        arguments = *samples, *_rows(sources[group]), *_rows(values[group])
-        launch(kernels.copy_rows, len(slots), slots, begin, end, *arguments, marked)
+        arguments = *(samples or (None, None)), *_rows(sources[group]), *_rows(values[group])
+        launch(kernels.copy_rows, len(slots), slots, begin, end, *arguments, changed)
 
 
 @torch.no_grad()

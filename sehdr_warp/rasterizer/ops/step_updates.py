@@ -43,13 +43,8 @@ def decide_step(
             intersections and counts the steps with overflow.
         intersections: int64 scalar.
     """
-    step_flags, device = finiteness.new_empty(2), finiteness.device
-    if overflow is None:
-        overflow = torch.empty(0, dtype=torch.bool, device=device)
-    counters = [
-        torch.empty(0, dtype=torch.int64, device=device) if t is None else t for t in (step_counters, intersections)
-    ]
-    launch(kernels.decide_step, 1, loss.detach(), finiteness, overflow, *counters, step_flags)
+    step_flags = finiteness.new_empty(2)
+    launch(kernels.decide_step, 1, loss.detach(), finiteness, overflow, step_counters, intersections, step_flags)
     return StepFlags(*step_flags)
 
 
@@ -71,7 +66,7 @@ def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
     flat = [gradient.reshape(-1) for gradient in gradients if gradient.numel()]
     for start in range(0, len(flat), kernels.TENSORS_PER_CHECK):
         group = flat[start : start + kernels.TENSORS_PER_CHECK]
-        arguments = group + [result[:0]] * (kernels.TENSORS_PER_CHECK - len(group))
+        arguments = group + [None] * (kernels.TENSORS_PER_CHECK - len(group))
         launch(kernels.find_nonfinite, max(map(len, group)), *arguments, result)
     return result
 
@@ -153,7 +148,6 @@ def adam_steps(
 
 
 def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, active_count=None) -> None:
-    nothing, active_count = [skipped.view(1)[:0]] * 6, _active_count(active_count, skipped)
     for start in range(0, len(steps), kernels.PARAMETERS_PER_LAUNCH):
         group = steps[start : start + kernels.PARAMETERS_PER_LAUNCH]
         absent = kernels.PARAMETERS_PER_LAUNCH - len(group)
@@ -161,7 +155,7 @@ def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, active_
         for parameter, gradient, first_moment, second_moment, step, rate, _ in group:
             flat = (tensor.view(-1) for tensor in (parameter, first_moment, second_moment))
             arguments += [gradient.view(-1), step.view(1), _rate(rate, skipped).view(1), *flat]
-        arguments += nothing * absent
+        arguments += [None] * (6 * absent)
         most = max(step.parameter.numel() for step in group)
         launch(kernels.update_by_adam, most, skipped.view(1), active_count, *arguments)
 
@@ -189,7 +183,7 @@ def harmonics_adam_step(
     """
     if not parameter.numel():
         return
-    options = step, _rate(rate, skipped), skipped, _active_count(active_count, skipped), _adam_numbers(betas, epsilon)
+    options = step, _rate(rate, skipped), skipped, active_count, _adam_numbers(betas, epsilon)
     values = parameter.view(-1), first_moment.view(-1), second_moment.view(-1)
     kernel = kernels.harmonics_adam_kernel(parameter.shape[1])
     in_turn = parameter.numel()
@@ -198,10 +192,6 @@ def harmonics_adam_step(
     stride = -(-in_turn // kernels.VALUES_PER_THREAD)
     arguments = gradients.basis, gradients.grad_colors, start, stride, update_interval, *options, *values
     launch(kernel, stride, *arguments)
-
-
-def _active_count(active_count: Tensor | None, like: Tensor) -> Tensor:
-    return torch.empty(0, dtype=torch.int32, device=like.device) if active_count is None else active_count
 
 
 def _rate(rate: Tensor | float, like: Tensor) -> Tensor:

@@ -85,14 +85,8 @@ def fixed_launch(
 ) -> FixedLaunch:
     """Return launch()'s launch as an object, for tensors that stay where they are but for some.
 
-    Args:
-        kernel: as launch() takes it, as are dim, arguments, gradients and block_dim.
-        dim: number of threads.
-        *arguments: the kernel's arguments.
-        gradients: for the adjoint.
-        strided: tensors among arguments and gradients that each launch gives anew, with any distance from row to row.
-        by_address: those whose addresses each launch gives; their layout stays.
-        block_dim: threads per block.
+    strided: tensors among arguments and gradients that each launch gives anew, with any distance from row to row.
+    by_address: those whose addresses each launch gives; their layout stays. The others are launch()'s.
     """
     device, values = _all_values(kernel, arguments, gradients)
     packed = PackedLaunch(kernel, device, block_dim, gradients is not None, dim, values)

@@ -131,12 +131,8 @@ class PackedLaunch:
 class FixedLaunch:
     """A launch whose arguments stay, but for the addresses of some tensors: a third of the host time of a packed one.
 
-    Args:
-        packed: the kernel's launch, which nothing else uses.
-        dim: number of threads.
-        values: all arguments. Those that stay are kept alive.
-        strided: those of the values that each launch gives anew, with any distance from row to row.
-        by_address: those of the values whose addresses each launch gives; their layout stays.
+    packed: the kernel's launch, which nothing else uses. values: all arguments; those that stay are kept alive.
+    strided, by_address: those of the values that each launch gives anew, see fixed_launch().
     """
 
     def __init__(
@@ -200,14 +196,8 @@ def _on_stream(command: Any) -> Callable[[int, None], int]:
 class _Slot:
     """A packed array that tensors of one layout take in turn.
 
-    Attributes:
-        array: its descriptor.
-        shape: of the array; a view of the descriptor.
-        strides: of the array, bytes; a view of the descriptor.
-        length: shape[0] unless the array is empty.
-        is_empty: whether it is.
-        step: numbers from row to row, as the strides have it; -1 if unknown.
-        size: bytes of a number.
+    array is its descriptor; shape and strides (bytes) are views of it. length: shape[0] unless is_empty. step: numbers
+    from row to row, as the strides have it; -1 if unknown. size: bytes of a number.
     """
 
     __slots__ = ("array", "is_empty", "length", "shape", "size", "step", "strides")
