@@ -23,12 +23,9 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
 
     The kernel's `forward_extents` is the forward pass's extents in the adjoint, and None in the forward pass.
 
-    Args:
-        dtype: wp.float32 or wp.float64.
-        antialiased: lower the opacity by sqrt(det / det_blurred), so that the blur by eps2d keeps a Gaussian's energy
-            (Yu et al. 2024, Mip-Splatting).
-        differentiate_compensation: differentiate that factor with respect to the covariance, as gsplat does; otherwise
-            it is constant in the gradient.
+    antialiased: lower the opacity by sqrt(det / det_blurred), so that the blur by eps2d keeps a Gaussian's energy (Yu
+    et al. 2024, Mip-Splatting). differentiate_compensation: differentiate that factor with respect to the covariance,
+    as gsplat does; otherwise it is constant in the gradient.
     """
     g = geometry(dtype)
     real, vec2, vec3, vec4, mat44 = g.real, g.vec2, g.vec3, g.vec4, g.mat44

@@ -42,15 +42,8 @@ def blend_on_cuda(
 class BlockBackward:
     """The backward pass of blend_on_cuda(); see blending.py.
 
-    Attributes:
-        features: [N, C] or, padded, [N, more].
-        channels: C.
-        lists: that were blended.
-        packed: Gaussians that were blended.
-        transmittance: [H, W], the result.
-        last_contributor: [H W] int32, 1 + the index of a pixel's last Gaussian in its tile's list, or 0.
-        alpha_threshold: contributions with a smaller alpha were left out.
-        deterministic: sum in a fixed order.
+    features: [N, C] or, padded, [N, more]. transmittance: [H, W], the result. last_contributor: [H W] int32, 1 + the
+    index of a pixel's last Gaussian in its tile's list, or 0.
     """
 
     features: Tensor

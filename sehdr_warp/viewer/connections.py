@@ -47,12 +47,7 @@ class Connection:
     """One connection: what it does, since when, and how many bytes of answers it holds."""
 
     def __init__(self, client: socket.socket, others: "Connections"):
-        """Wrap the socket of a client.
-
-        Args:
-            client: The socket.
-            others: All open connections of the server.
-        """
+        """Wrap the socket of a client; `others` are all open connections of the server."""
         self.socket, self._others = client, others
         self.answering = self.sending = self.receiving = self.closed = False
         self.since, self.reserved_bytes = time.monotonic(), 0

@@ -23,20 +23,16 @@ _HIDDEN_LOGIT = -30.0  # Of an opacity below 1/255, which is not drawn
 
 @dataclass
 class EditedOpacities:
-    """Hides Gaussians of a model by their opacities, so that a preview needs no copy of the scene.
-
-    Attributes:
-        original: [N] logits before the first edit; None if nothing is hidden.
-    """
+    """Hides Gaussians of a model by their opacities, so that a preview needs no copy of the scene."""
 
     original: Tensor | None = None
+    """[N] logits before the first edit; None if nothing is hidden."""
 
     @torch.no_grad()
     def apply(self, run: Any, edits: SplatEdits | None) -> int:
         """Show what edits leave of a run, or all of it for None; return the number of Gaussians that are shown.
 
-        Raises:
-            SehdrError: If nothing is left; the scene then stays as it was.
+        Raises SehdrError if nothing is left; the scene then stays as it was.
         """
         logits = run.field.gaussians.opacity_logits
         current = logits.detach().clone()
@@ -58,25 +54,16 @@ class EditedOpacities:
 
 @dataclass
 class LightGains:
-    """Makes lights of a model brighter or darker by the colors of their Gaussians.
-
-    Attributes:
-        original: The harmonics before the first gain: [N, 3] and [N, K, 3]; None without gains.
-    """
+    """Makes lights of a model brighter or darker by the colors of their Gaussians."""
 
     original: tuple[Tensor, Tensor] | None = None
+    """The harmonics before the first gain: [N, 3] and [N, K, 3]; None without gains."""
 
     @torch.no_grad()
     def apply(self, run: Any, lights: Sequence[Light], stops: Mapping[int, float]) -> None:
-        """Show lights with gains, and all others as they were trained.
+        """Show lights with gains in stops by their index, and all others as they were trained.
 
-        Args:
-            run: The run that is shown.
-            lights: Its lights.
-            stops: Gain of each light that has one, by its index.
-
-        Raises:
-            SehdrError: For a gain out of range, or a model whose lights cannot be scaled.
+        Raises SehdrError for a gain out of range, or a model whose lights cannot be scaled.
         """
         model = run.field
         if model.color_model.display_referred or model.fusion is not None:
@@ -101,14 +88,10 @@ class LightGains:
 
 
 def edits_of(request: dict, photos: Callable[[], Sequence[View]]) -> SplatEdits | None:
-    """Return the edits that a page asks for; None for none.
+    """Return the edits of a request: any of "crop", "cut", "min_opacity", "min_views" and "mask_only"; None for none.
 
-    Args:
-        request: Any of the regions "crop" and "cut", "min_opacity", "min_views" and "mask_only".
-        photos: Returns the photos with their masks, for "mask_only".
-
-    Raises:
-        SehdrError: For a value that cannot be, or masks that are not there.
+    photos: returns the photos with their masks, for "mask_only". Raises SehdrError for a value that cannot be, or masks
+    that are not there.
     """
     edits: dict[str, Any] = {
         name: kind(request[name])

@@ -98,11 +98,8 @@ class ViewerScene:
     def edit(self, edits: SplatEdits | None, merged: Sequence["ViewerScene"] = ()) -> None:
         """Show what edits leave of the scene and of scenes that are merged with it, or all of them for None.
 
-        Gains of lights end when other scenes are merged, because the lights are others.
-
-        Raises:
-            SehdrError: If nothing is left, a merged scene is this one or has edits, or merge_scenes() refuses it; what
-                is shown then stays as it was.
+        Gains of lights end when other scenes are merged, because the lights are others. Raises SehdrError if nothing is
+        left, a merged scene is this one or has edits, or merge_scenes() refuses it; what is shown then stays.
         """
         for other in merged:
             if other is self or other.visible_count is not None:
@@ -219,8 +216,7 @@ class ViewerScene:
 def camera_of(values: dict) -> Camera:
     """Return the camera that a page describes.
 
-    Raises:
-        ValueError: For a bad value, or a picture that is too large; KeyError or TypeError for a missing or wrong field.
+    Raises ValueError for a bad value, or a picture that is too large; KeyError or TypeError for a wrong field.
     """
     camera = Camera.from_dict(values)
     if camera.width * camera.height > MOST_PIXELS:

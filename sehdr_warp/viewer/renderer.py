@@ -21,11 +21,7 @@ class Renderer:
     """
 
     def __init__(self, beside: bool = False) -> None:
-        """Start the threads.
-
-        Args:
-            beside: Make small pictures beside large ones as well: on a CPU, where a large picture takes seconds.
-        """
+        """Start the threads; `beside`: one more for small pictures, on a CPU, where a large one takes seconds."""
         self._waiting: list[_Picture] = []
         self._changed, self._closed, self._numbers = threading.Condition(), False, count()
         names = ["sehdr-warp viewer renders", *["sehdr-warp viewer renders small"] * beside]
@@ -37,14 +33,9 @@ class Renderer:
             thread.start()
 
     def call(self, make: Callable[[], Any], pixels: int = 0) -> Any:
-        """Return what `make` returns on the thread.
+        """Return what `make` returns on the thread; larger pictures, by their pixels, let smaller ones go first.
 
-        Args:
-            make: What is done.
-            pixels: Of the picture that it makes, by which others go first.
-
-        Raises:
-            RuntimeError: If the thread was ended, also while this waited.
+        Raises RuntimeError if the thread was ended, also while this waited.
         """
         future: Future[Any] = Future()
         with self._changed:

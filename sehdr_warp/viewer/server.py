@@ -62,10 +62,8 @@ class Viewer:
     ):
         """Set what is shown.
 
-        Args:
-            runs: Scenes to look at and compare.
-            photos: Returns the views of a run by name, and reads them on first use; raises SehdrError if they are gone.
-            training: A LiveTraining, if one runs.
+        photos: returns the views of a run by name, and reads them on first use; raises SehdrError if they are gone.
+        training: a LiveTraining, if one runs.
         """
         self.runs, self.training, self.saving = list(runs), training, ""
         self._photos, self._reading, self._saving = photos, threading.Lock(), threading.Lock()
@@ -250,11 +248,7 @@ class Server(ThreadingHTTPServer):
     def __init__(self, viewer: Viewer, host: str = "127.0.0.1", port: int = 8080, origins: Sequence[str] = ()):
         """Listen on the port, or on the next free one.
 
-        Args:
-            viewer: What is shown.
-            host: Address to listen on.
-            port: First port to try.
-            origins: Origins of a proxy before this server, such as https://splats.example.org.
+        origins: of a proxy before this server, such as https://splats.example.org.
         """
         self.viewer, self.host, self.origins = viewer, host, tuple(origins)
         self.security_policy = f"{_POLICY}; frame-ancestors 'self' vscode-webview: {' '.join(self.origins)}".strip()

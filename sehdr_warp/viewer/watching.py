@@ -21,12 +21,7 @@ class Watch(threading.Thread):
     """
 
     def __init__(self, paths: Sequence[Path], load: Callable[[Path], Any]):
-        """Load all scenes.
-
-        Args:
-            paths: Of runs, or files of Gaussians.
-            load: Returns the run, or the Gaussians, of a path; raises SehdrError.
-        """
+        """Load the scene at each path; `load` returns it, or raises SehdrError."""
         super().__init__(daemon=True)
         self._load, self._ended = load, threading.Event()
         self._states = [_state(path) for path in paths]  # Before they are read: what comes between is not missed.

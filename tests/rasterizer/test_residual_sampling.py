@@ -44,5 +44,14 @@ def test_masked_errors_and_those_at_the_border_are_not_meant(device):
     assert {tuple(pixel) for pixel in pixels[meant].tolist()} == {(7, 9)}
 
 
+@pytest.mark.parametrize("light", [float("inf"), 1e38, -1e38])
+def test_light_out_of_range_counts_as_white_or_black(device, light):
+    codes, image = np.zeros((9, 12, 3), np.uint8), torch.full((9, 12, 3), -float("inf"))
+    image[4, 3] = light
+    pixels, meant = sampled_pixels(image, codes, device)
+    assert meant.all() == (light > 0)
+    assert light < 0 or {tuple(pixel) for pixel in pixels.tolist()} == {(7, 9)}
+
+
 def test_where_all_is_explained_nothing_is_meant(device):
     assert not sampled_pixels(torch.zeros(9, 12, 3), np.zeros((9, 12, 3), np.uint8), device)[1].any()

@@ -101,6 +101,19 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     assert lists.subtile_masks is None or torch.equal(corners[: lists.intersection_count], lists.subtile_masks)
 
 
+def test_depths_beyond_the_bits_of_the_keys_keep_their_order_up_to_ties(device):
+    """Keys tell depths from 2^-40 to 2^88 apart; nearer and farther ones are alike, in the order of indices."""
+    depths = torch.tensor([1e30, 3e38, 1e-30, 1e-38, 1.0, 1e20, 1e-10], device=device)
+    splats = packed(random_scene(count=7, width=16, height=16).to(torch.float32, device))
+    x, cutoff = torch.tensor([8.0, 8.0, 0.5, 8.0], device=device), torch.tensor([1.0, 0.0, 1.0, 9.0], device=device)
+    everywhere = {"means_opacities": x.repeat(7, 1), "conics_cutoffs": cutoff.repeat(7, 1)}
+    one = {"counts": torch.ones_like(splats.counts), "extents": torch.full_like(splats.extents, 3.0)}
+    splats = splats._replace(depths=depths, **everywhere, **one)
+    for keep_emit_order, expected in ((False, [2, 3, 6, 4, 5, 0, 1]), (True, [3, 2, 6, 4, 5, 0, 1])):
+        offsets = order_intersections(splats, keep_emit_order=keep_emit_order)
+        assert build_tile_lists(splats, offsets, 16, 16).gaussians.tolist() == expected
+
+
 def test_subtiles_are_those_that_an_ellipse_touches(device):
     """Beside what all pixels of a subtile see of a Gaussian, drawn alone."""
     scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)

@@ -31,12 +31,9 @@ class _View(NamedTuple):
 class GradientMemory:
     """Zeros that a backward pass of blend and projection adds to, and the views of them that it returns.
 
-    Attributes:
-        zeros: all of it.
-        of_splats: by means2d and features, and if the CUDA graph begins with 2D Gaussians, by conics and opacities;
-            emptied when they are returned, because torch takes a leaf's gradient without a copy only if nothing else
-            refers to it.
-        of_gaussians: by the projection's inputs, None where not needed.
+    of_splats: by means2d and features, and if the CUDA graph begins with 2D Gaussians, by conics and opacities; emptied
+    when they are returned, because torch takes a leaf's gradient without a copy only if nothing else refers to it.
+    of_gaussians: by the projection's inputs, None where not needed.
     """
 
     zeros: Tensor
@@ -50,14 +47,9 @@ class GradientLayout:
     It begins with a row for each Gaussian, which the blend adds to: features, conic, x, y, opacity, and columns that
     pad the row. Then come a copy of the features' gradient and the gradients by the projection's inputs.
 
-    Args:
-        blend: of the render.
-        gaussians: inputs of the projection, None where no gradient is needed; none if the CUDA graph begins with 2D
-            Gaussians.
-        copies_features: add a contiguous gradient by features, which torch can use as a leaf's without a copy.
-
-    Attributes:
-        like: a tensor of the shape of all of it that takes no memory, for torch.empty_like().
+    gaussians: inputs of the projection, None where no gradient is needed; empty if the CUDA graph begins with 2D
+    Gaussians. copies_features: add a contiguous gradient by features, which torch can use as a leaf's without a copy.
+    like: a tensor of the shape of all of it that takes no memory, for torch.empty_like().
     """
 
     def __init__(self, blend: BlockBackward, gaussians: Sequence[Tensor | None], *, copies_features: bool) -> None:

@@ -35,13 +35,9 @@ def decide_step(
 
     Returns the decision, and counts it in step_counters.
 
-    Args:
-        loss: float32 scalar.
-        finiteness: [K] float32, finiteness_of() the gradients.
-        overflow: bool scalar.
-        step_counters: [3] int64, counts steps that are not finite; with intersections it also holds the most
-            intersections and counts the steps with overflow.
-        intersections: int64 scalar.
+    loss: float32 scalar. finiteness: [K] float32, finiteness_of() the gradients. overflow: bool scalar. step_counters:
+    [3] int64, counts steps that are not finite; with intersections, an int64 scalar, it also holds the most
+    intersections and counts the steps with overflow.
     """
     step_flags = finiteness.new_empty(2)
     launch(kernels.decide_step, 1, loss.detach(), finiteness, overflow, step_counters, intersections, step_flags)

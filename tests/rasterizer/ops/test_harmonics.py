@@ -49,6 +49,20 @@ def test_basis_is_the_real_spherical_harmonics(device, degree):
         assert relative_error(ours, truth) < bound
 
 
+@pytest.mark.parametrize("offset", [0.0, 1e-20, 1e25, float("inf")])
+@pytest.mark.parametrize("with_jacobian", [False, True])
+def test_a_mean_without_a_direction_has_the_constant_term_alone(device, offset, with_jacobian, monkeypatch):
+    """At the camera, nearer than float32 can tell, and so far that squares overflow."""
+    monkeypatch.setattr(harmonics, "writes_jacobian", lambda device: with_jacobian)
+    coefficients, means, camera = (t.to(device, torch.float32) for t in inputs(2))
+    means[0] = camera + torch.tensor([offset, 0.0, 0.0], device=device)
+    leaves = [tensor.requires_grad_() for tensor in (coefficients, means, camera)]
+    values = spherical_harmonics(3, *leaves)
+    torch.testing.assert_close(values[0], coefficients[0, 0] * 0.28209479177387814)
+    values.sum().backward()
+    assert all(leaf.grad.isfinite().all() for leaf in leaves) and not means.grad[0].any() and means.grad[1].any()
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("which", range(3), ids=["coefficients", "means", "camera_position"])
 @pytest.mark.parametrize("with_jacobian", [False, True])

@@ -41,8 +41,21 @@ def test_poison_stays_where_it_is(device):
     values = interpolate(table, 0.0, 0.1, positions)
     assert values[0].isnan()
     assert values[1].isfinite()
-    assert values[3] == table[1, 0]
+    assert values[3] == table[1, 0] and not values[2].isfinite()
     assert interpolate(table, 0.0, 0.1, positions[:0]).shape == (0, 1)
+
+
+@pytest.mark.parametrize("position", [-1e30, -1e-30, 1e-30, 1e6, 1e30])
+def test_far_positions_have_the_values_and_slopes_of_float64(device, position):
+    table = torch.rand(20, 3, generator=torch.Generator().manual_seed(2)) + torch.arange(20)[:, None]
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = torch.full((1, 3), position, dtype=dtype, device=device).requires_grad_()
+        values = interpolate(table.to(device, dtype), 0.0, 0.1, leaf)
+        values.sum().backward()
+        results.append((values, leaf.grad))
+    for ours, truth in zip(*results, strict=True):
+        torch.testing.assert_close(ours.double(), truth, rtol=1e-4, atol=1e-5)
 
 
 def test_what_does_not_fit_is_refused(device):

@@ -1,5 +1,8 @@
 """Relocation of Gaussians on the device: shares of opacity by equation 9, and rows in their slots."""
 
+import math
+
+import pytest
 import torch
 
 from sehdr_warp.rasterizer.ops.relocation import (
@@ -32,6 +35,14 @@ def test_shares_are_those_of_equation_9(device):
     # So many of them together are as opaque as the one was.
     together = 1 - (1 - torch.sigmoid(logits.double())) ** parts
     torch.testing.assert_close(together[:2], opacities[:2].double(), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("logit", [-math.inf, -100.0, 100.0, math.inf])
+def test_extreme_opacities_are_shared_in_finite_numbers(device, logit):
+    logits, log_scales = torch.full((2,), logit, device=device), torch.zeros(2, 3, device=device)
+    share_opacities(logits, log_scales, torch.tensor([1, 60], dtype=torch.int32, device=device), least=0.005)
+    assert logits.isfinite().all() and log_scales.isfinite().all()
+    assert (torch.sigmoid(logits) > 0.0049).all() and (log_scales <= 0).all()
 
 
 def scalar(value, device):
