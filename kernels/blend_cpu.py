@@ -88,7 +88,7 @@ def row_functions(dtype, exp_squarings: int):
             return e
 
     @wp.func
-    def halves(x: real, conic_cutoff: vec4) -> wp.vec2i:
+    def reached_halves(x: real, conic_cutoff: vec4) -> wp.vec2i:
         """Return the first half that is reached and one past the last; x: from the tile's first pixel to the center."""
         determinant = conic_cutoff[0] * conic_cutoff[2] - conic_cutoff[1] * conic_cutoff[1]
         reached = wp.vec2i(0, wp.static(HALVES))
@@ -100,7 +100,7 @@ def row_functions(dtype, exp_squarings: int):
             reached = wp.vec2i(int(first), int(wp.floor(last)) + 1)
         return reached
 
-    return row, broadcast, step, exponential, halves
+    return row, broadcast, step, exponential, reached_halves
 
 
 def _options(dtype) -> dict:
@@ -129,7 +129,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
         image: [H W, C].
         final_transmittance: [H W], of all Gaussians together.
     """
-    row, broadcast, step, exponential, halves = row_functions(dtype, exp_squarings)
+    row, broadcast, step, exponential, reached_halves = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
@@ -165,7 +165,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
             y = xy_opacity[1] - real(y0) - real(0.5)
             top = int(wp.max(wp.ceil(y - xy_opacity[3]), real(0.0)))
             bottom = int(wp.min(wp.floor(y + xy_opacity[3]), real(wp.static(size - 1)))) + 1
-            reached = halves(x, conic_cutoff)
+            reached = reached_halves(x, conic_cutoff)
             for half in range(reached[0], reached[1]):
                 dx = broadcast(x - real(half * lanes)) - offsets
                 in_x = wp.cw_mul(dx, dx) * (real(-0.5) * conic_cutoff[0])
@@ -223,7 +223,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
         sums: scratch, [tiles, C + 6] rows.
         grad_intersections: [M, C + 6] in the order of emission: features, conic a b c, x, y, opacity.
     """
-    row, broadcast, step, exponential, halves = row_functions(dtype, exp_squarings)
+    row, broadcast, step, exponential, reached_halves = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
@@ -281,7 +281,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
             target = emit_indices[k]
             for column in range(wp.static(channels + 6)):
                 sums[tile, column] = broadcast(real(0.0))
-            reached = halves(x, conic_cutoff)
+            reached = reached_halves(x, conic_cutoff)
             for half in range(reached[0], reached[1]):
                 dx = broadcast(x - real(half * lanes)) - offsets
                 in_x = wp.cw_mul(dx, dx) * (real(-0.5) * conic_cutoff[0])

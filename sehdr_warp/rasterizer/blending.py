@@ -129,7 +129,7 @@ def blend_on_cpu(
     emit_order, tiles, channels = lists.emit_order, lists.grid.tiles, features.shape[1]
     assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
     highest = float(packed.means_opacities[:, 2].max()) if len(features) else 0.0
-    kind = warp_scalar(features.dtype), channels, exp_squarings(alpha_threshold / max(highest, 1.0))
+    scalar, squarings = warp_scalar(features.dtype), exp_squarings(alpha_threshold / max(highest, 1.0))
     ranges = balanced_ranges(lists)
     lane_offsets = torch.arange(blend_cpu.LANES, dtype=features.dtype, device=features.device)
     sizes = lists.grid.columns, lists.width, lists.height
@@ -142,7 +142,7 @@ def blend_on_cpu(
     inputs = lists.tile_ranges, lists.gaussians, *shared
     outputs = last_contributor, image.view(-1, channels), transmittance
     arguments = *inputs, tile_transmittance, scratch(channels, ROWS_OF_TILE), *outputs
-    launch(blend_cpu.forward_kernel(*kind), tiles, *arguments, ranges=ranges)
+    launch(blend_cpu.forward_kernel(scalar, channels, squarings), tiles, *arguments, ranges=ranges)
 
     def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
         if grad_transmittance is None:
@@ -155,7 +155,7 @@ def blend_on_cpu(
         by_row = scratch(TILE_SIZE), scratch(TILE_SIZE), scratch(channels + 6)
         inputs = lists.tile_ranges, lists.gaussians, emit_order.emit_indices, *shared
         arguments = *inputs, *gradients, *by_pixel, *by_row, grad_intersections
-        launch(blend_cpu.backward_kernel(*kind), tiles, *arguments, ranges=ranges)
+        launch(blend_cpu.backward_kernel(scalar, channels, squarings), tiles, *arguments, ranges=ranges)
         return emit_order.sum_by_gaussian(grad_intersections)
 
     return backward

@@ -168,7 +168,8 @@ def rasterize(
             rendering.image = rendering.image + rendering.transmittance[..., None] * behind
         return rendering
     except (RuntimeError, MemoryError):  # The context around all of it would take 2 us of each call.
-        options.checked(means.device)  # Torch replays no CUDA graph during a capture; this tells what to do.
+        # Within a capture of the caller's, where nothing can be replayed, this raises the error that says what to do.
+        options.checked(means.device)
         with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
             raise
 

@@ -110,21 +110,13 @@ def rasterize_directions(
 
 
 class _SphereSplats(NamedTuple):
-    """Gaussians on the unit sphere around a position.
+    """Gaussians on the unit sphere around a position."""
 
-    Attributes:
-        caps: [N, 4] unit direction, and the angle around it within which a Gaussian counts; 0 if culled.
-        across: [N, 3], with `along` the root of the inverse covariance.
-        along: [N, 3].
-        opacities: [N].
-        distances: [N] from the position; 0 if culled.
-    """
-
-    caps: Tensor
-    across: Tensor
-    along: Tensor
-    opacities: Tensor
-    distances: Tensor
+    caps: Tensor  # [N, 4] unit direction, and the angle around it within which a Gaussian counts; 0 if culled
+    across: Tensor  # [N, 3], with `along` the root of the inverse covariance
+    along: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    distances: Tensor  # [N] from the position; 0 if culled
 
 
 @torch.no_grad()

@@ -68,31 +68,22 @@ def tile_grid(width: int, height: int) -> TileGrid:
 class IntersectionOffsets(NamedTuple):
     """The order in which Gaussians emit intersections, and where each one's end.
 
-    Attributes:
-        order: [N] int32 Gaussians by depth; None for the order of their indices, after which the sort by tile also
-            sorts by depth.
-        cumulative_counts: [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order.
-        keep_emit_order: whether the lists get TileLists.emit_order.
+    order: [N] int32 Gaussians by depth; None for the order of their indices, after which the sort by tile also sorts by
+    depth.
     """
 
     order: Tensor | None
-    cumulative_counts: Tensor
-    keep_emit_order: bool
+    cumulative_counts: Tensor  # [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order
+    keep_emit_order: bool  # Whether the lists get TileLists.emit_order
 
 
 @dataclass(frozen=True)
 class EmitOrder:
-    """The order of intersections before the sort by tile, in which those of one Gaussian are neighbors.
+    """The order of intersections before the sort by tile, in which those of one Gaussian are neighbors."""
 
-    Attributes:
-        order: [N] int32 Gaussians by depth, nearest first (ties by index; culled ones last).
-        cumulative_counts: [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order.
-        emit_indices: [M] int32 index of each sorted intersection before the sort.
-    """
-
-    order: Tensor
-    cumulative_counts: Tensor
-    emit_indices: Tensor
+    order: Tensor  # [N] int32 Gaussians by depth, nearest first (ties by index; culled ones last)
+    cumulative_counts: Tensor  # [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order
+    emit_indices: Tensor  # [M] int32 index of each sorted intersection before the sort
 
     def sum_by_gaussian(self, grad_intersections: Tensor) -> Tensor:
         """Return [N, columns]: the sum over the intersections of each Gaussian, in the order of tiles.

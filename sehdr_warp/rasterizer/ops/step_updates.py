@@ -84,25 +84,15 @@ class _ByOne(torch.autograd.Function):
 
 
 class AdamStep(NamedTuple):
-    """One parameter's step of Adam.
-
-    Attributes:
-        parameter: contiguous float32, as the next three of one shape.
-        gradient: of the parameter.
-        first_moment: changed in place.
-        second_moment: changed in place.
-        step: float32 of one element, the number of this step, from 1.
-        rate: float32 of one element, or a number, which cannot change in a CUDA graph.
-        width: numbers in a Gaussian's row if adam_steps() gets `active_count`; else 0.
-    """
+    """One parameter's step of Adam; the first four are contiguous float32 of one shape."""
 
     parameter: Tensor
     gradient: Tensor
     first_moment: Tensor
     second_moment: Tensor
-    step: Tensor
-    rate: Tensor | float
-    width: int = 0
+    step: Tensor  # float32 of one element, the number of this step, from 1
+    rate: Tensor | float  # float32 of one element, or a number, which cannot change in a CUDA graph
+    width: int = 0  # Numbers in a Gaussian's row if adam_steps() gets `active_count`; else 0
 
 
 @torch.no_grad()
