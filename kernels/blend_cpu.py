@@ -117,7 +117,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
 
     The kernel's arguments:
         tile_ranges: [tiles] first and one past the last intersection.
-        intersections: [M] Gaussians.
+        gaussians: [M] the Gaussian of each intersection.
         means_opacities: [N] (x, y, opacity, half-height).
         conics_cutoffs: [N] (conic a, b, c, cutoff).
         features: [N, C].
@@ -135,7 +135,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_forward(
         range_start: int,
-        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        tile_ranges: wp.array(dtype=wp.vec2i), gaussians: wp.array(dtype=wp.int32),
         means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
         columns: int, width: int, height: int, alpha_threshold: real,
         lane_offsets: wp.array(dtype=row), tile_transmittance: wp.array2d(dtype=row),
@@ -158,7 +158,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
         k = bounds[0]
         alive = bool(True)
         while k < bounds[1] and alive:
-            i = intersections[k]
+            i = gaussians[k]
             xy_opacity = means_opacities[i]
             conic_cutoff = conics_cutoffs[i]
             x = xy_opacity[0] - real(x0) - real(0.5)
@@ -229,7 +229,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
         range_start: int,
-        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        tile_ranges: wp.array(dtype=wp.vec2i), gaussians: wp.array(dtype=wp.int32),
         emit_indices: wp.array(dtype=wp.int32),
         means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array2d(dtype=real),
         columns: int, width: int, height: int, alpha_threshold: real,
@@ -270,7 +270,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
 
         for step_back in range(blend_count):
             k = bounds[0] + blend_count - 1 - step_back
-            i = intersections[k]
+            i = gaussians[k]
             xy_opacity = means_opacities[i]
             conic_cutoff = conics_cutoffs[i]
             x = xy_opacity[0] - real(x0) - real(0.5)

@@ -102,7 +102,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
 
     The kernel's arguments:
         tile_ranges: [tiles] first and one past the last intersection.
-        intersections: [M] Gaussians.
+        gaussians: [M] the Gaussian of each intersection.
         subtile_masks: [M] of find_tile_ranges().
         means_opacities: [N] (x, y, opacity, -).
         conics_cutoffs: [N] (conic a, b, c, cutoff).
@@ -125,7 +125,7 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         module_options=module_options(dtype),
     )
     def blend_forward(
-        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        tile_ranges: wp.array(dtype=wp.vec2i), gaussians: wp.array(dtype=wp.int32),
         subtile_masks: wp.array(dtype=wp.uint8),
         means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
         columns: int, width: int, height: int, alpha_threshold: real,
@@ -164,12 +164,12 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
         queued = int(0)
         ready = int(0)
 
-        gaussians = vec_rounds()
+        upcoming = vec_rounds()
         touched = vec_rounds()
         if count > 0:
             for k in range(wp.static(ROUNDS)):
                 at = begin + wp.min(k * 32 + lane, final)
-                gaussians[k] = intersections[at]
+                upcoming[k] = gaussians[at]
                 touched[k] = int(subtile_masks[at])
         turns = (count + wp.static(32 * ROUNDS - 1)) // wp.static(32 * ROUNDS)
         turn = int(0)
@@ -182,12 +182,12 @@ def forward_kernel(dtype, channels: int, cuda: bool = False):
                     hit = position < count and ((touched[k] >> subtile) & 1) == 1
                     mask = votes(hit, lane)
                     slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
-                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], position + 1), hit)
+                    wp.tile_scatter_masked(queue, slot, wp.vec2i(upcoming[k], position + 1), hit)
                     queued += wp.bit_count(mask)
                 turn += 1
                 for k in range(wp.static(ROUNDS)):
                     at = begin + wp.min(start + wp.static(32 * ROUNDS) + k * 32, final)
-                    gaussians[k] = intersections[at]
+                    upcoming[k] = gaussians[at]
                     touched[k] = int(subtile_masks[at])
             coming = wp.min(queued, 32)
             own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))

@@ -96,7 +96,7 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         module_options=module_options(dtype),
     )
     def blend_backward(
-        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        tile_ranges: wp.array(dtype=wp.vec2i), gaussians: wp.array(dtype=wp.int32),
         subtile_masks: wp.array(dtype=wp.uint8),
         means_opacities: wp.array(dtype=vec4), conics_cutoffs: wp.array(dtype=vec4), features: wp.array(dtype=vec4),
         columns: int, width: int, height: int, alpha_threshold: real,
@@ -155,12 +155,12 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
         ready = int(0)
         ready_one = wp.vec2i(0, 0)
 
-        gaussians = vec_rounds()
+        upcoming = vec_rounds()
         touched = vec_rounds()
         if count > 0:
             for k in range(wp.static(ROUNDS)):
                 at = begin + wp.max(count - 1 - (k * 32 + lane), 0)
-                gaussians[k] = intersections[at]
+                upcoming[k] = gaussians[at]
                 touched[k] = int(subtile_masks[at])
         turns = (count + wp.static(32 * ROUNDS - 1)) // wp.static(32 * ROUNDS)
         turn = int(0)
@@ -173,12 +173,12 @@ def backward_kernel(dtype, channels: int, ordered: bool, cuda: bool = False):
                     hit = position >= 0 and ((touched[k] >> subtile) & 1) == 1
                     mask = votes(hit, lane)
                     slot = (head + queued + wp.bit_count(mask & lanes_below)) & wp.static(QUEUE - 1)
-                    wp.tile_scatter_masked(queue, slot, wp.vec2i(gaussians[k], position), hit)
+                    wp.tile_scatter_masked(queue, slot, wp.vec2i(upcoming[k], position), hit)
                     queued += wp.bit_count(mask)
                 turn += 1
                 for k in range(wp.static(ROUNDS)):
                     at = begin + wp.max(start - wp.static(32 * ROUNDS) - k * 32, 0)
-                    gaussians[k] = intersections[at]
+                    upcoming[k] = gaussians[at]
                     touched[k] = int(subtile_masks[at])
             coming = wp.min(queued, 32)
             own = wp.tile_extract(queue, (head + lane) & wp.static(QUEUE - 1))

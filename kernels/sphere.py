@@ -168,7 +168,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def blend(
         range_start: int,
-        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        tile_ranges: wp.array(dtype=wp.vec2i), gaussians: wp.array(dtype=wp.int32),
         directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real), features: wp.array(dtype=features_type),
@@ -186,7 +186,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
             end = bounds[0]
             k = bounds[0]
             while k < bounds[1]:
-                i = intersections[k]
+                i = gaussians[k]
                 k += 1
                 cap = caps[i]
                 a = wp.dot(across[i], d)
@@ -208,7 +208,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=options)
     def blend_backward(
         range_start: int,
-        tile_ranges: wp.array(dtype=wp.vec2i), intersections: wp.array(dtype=wp.int32),
+        tile_ranges: wp.array(dtype=wp.vec2i), gaussians: wp.array(dtype=wp.int32),
         directions: wp.array(dtype=vec3),
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities: wp.array(dtype=real), features: wp.array(dtype=features_type),
@@ -229,7 +229,7 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
             k = ends[pixel]
             while k > begin:
                 k -= 1
-                i = intersections[k]
+                i = gaussians[k]
                 cap = caps[i]
                 forward = cap[0] * d[0] + cap[1] * d[1] + cap[2] * d[2]
                 a = wp.dot(across[i], d)

@@ -150,7 +150,7 @@ def rasterize(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
     tensors = RasterTensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
-    # A call like an earlier one, which a CUDA graph can render, has arguments that were checked then.
+    # The CUDA graphs of calls like this one, whose arguments were checked at the first of them; None on the CPU.
     pool = find_pool(tensors, options)
     if pool is None or background is not None:
         check_shapes(tensors, background)
