@@ -11,6 +11,7 @@ from torch import Tensor
 from ..scene import Camera
 from ..scene.wide_camera import pixels_of_directions, steradians, typical_focal_length
 from ..subsets import every_nth
+from .confidence import RESIDUAL_WEIGHT
 from .radiance_field import RadianceField
 
 CLIPPED = 0.3  # Share of the values of photos too bright for a Gaussian that clip, from which it can belong to a light
@@ -66,7 +67,7 @@ class Light:
         lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
         deviation: of log2 radiance, stops, of what photos clip; None if that was not measured. Edges and colors that do
             not clip do not count, because all its photos may err alike; where photos of half the exposure or less do
-            not clip, it is at most MEASURED_STOPS.
+            not clip, it is at most MEASURED_STOPS, or what the scene differs from unclipped values.
         share: of the light that reaches the middle of the training cameras.
         members: [K] int64, its Gaussians.
     """
@@ -123,7 +124,9 @@ def find_lights(
     # Photos of half the exposure or less measure lights and do not clip them, so these do not count.
     usual = [(part[0], each) for part, each in zip(sums, whites, strict=True) if each < 2 * white]
     too_bright = torch.stack([seen * (peak > BRIGHT * each) for seen, each in usual]).sum(0)
-    clips = clipped.to(mean.device) >= CLIPPED * too_bright / pixels.clamp_min(1e-20)
+    # The share is lower if the scene contradicts the other photos, which then weigh more.
+    weighted = too_bright + RESIDUAL_WEIGHT * (pixels - too_bright)
+    clips = clipped.to(mean.device) >= CLIPPED * too_bright / weighted.clamp_min(1e-20)
     members = (clips & (pixels > LEAST_SEEN) & (peak > BRIGHT * white)).nonzero()[:, 0]
     # Radiance up to which each photo measures what photos of the reference exposure clip.
     measurable = np.where(whites >= 2 * white, whites, 0.0)
@@ -135,6 +138,8 @@ def find_lights(
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
     brightness = peak[members].cpu().numpy()
     uncertainty = None if field.clipped_stops is None else field.clipped_stops.to(members.device)[members].cpu().numpy()
+    confidence = torch.ones_like(peak) if field.confidence is None else field.confidence.to(peak.device)
+    doubt = -confidence[members].clamp_min(2.0**-8).log2().cpu().numpy()
     shares = clipped.to(members.device)[members].cpu().numpy()
     covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
     total = max(float(_view_sums(field, _panorama(middle, focal), degree)[2].mean(1).sum()), 1e-30)
@@ -162,7 +167,9 @@ def find_lights(
             stops = uncertainty[group] / clip
             unobstructed = area_sums[:, 0] > 0.5 * area * angles_of_shape[holding]  # Else something hides the light.
             measured = brightness[group] < measurable[holding][unobstructed].max(initial=0.0)
-            stops[measured] = np.minimum(stops, MEASURED_STOPS)[measured]
+            # The scene may contradict the photos that measure it.
+            misfit = np.maximum(doubt[group] - uncertainty[group], 0) / np.maximum(1 - shares[group], 1e-6)
+            stops[measured] = np.minimum(stops, np.maximum(misfit, MEASURED_STOPS))[measured]
             deviation = float(np.average(stops, weights=weights[group] * clip))
         share = float(radiance.mean() * shape.solid_angle(middle)) / total
         if share >= LEAST_SHARE:
