@@ -120,7 +120,7 @@ def find_lights(
     mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]
     peak = mean.amax(1)
     most = field.response.white / float(np.quantile(times, 0.75, method="lower"))
-    white = _reference_white(np.minimum(whites, most), peak, pixels)
+    white = _reference_white(np.minimum(whites, most), peak, pixels)  # pyright: ignore[reportArgumentType]
     # Photos of half the exposure or less measure lights and do not clip them, so these do not count.
     usual = [(part[0], each) for part, each in zip(sums, whites, strict=True) if each < 2 * white]
     too_bright = torch.stack([seen * (peak > BRIGHT * each) for seen, each in usual]).sum(0)
