@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import refuse_paths
 from ..files import atomic_path, check_absent
-from ..kernels.constants import FRUSTUM_MARGIN, NEAR_PLANE
+from ..kernels.constants import EPS2D, FRUSTUM_MARGIN, NEAR_PLANE
 from ..model.baking import field_of, gaussians_of
 from ..runs.run import Splats
 from ..scene import Camera
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _HALF = float(np.finfo(np.float16).max)
+_ANY_FOCALS = 0.0, 1e9  # Pixels; if those of the photos are not known, every picture is filtered like a photo
 
 
 def write_scene_page(
@@ -89,6 +90,9 @@ def write_scene_page(
         "columns": list(columns),
         "near": NEAR_PLANE * run.field.normalization.unit,
         "margin": FRUSTUM_MARGIN,
+        "eps2d": EPS2D,
+        "photo_eps2d": 0 if run.field.antialiased else EPS2D,
+        "focals": run.field.photo_focals or _ANY_FOCALS,
         "base_time": run.base_time,
         "grey": display_gain(run.response),
         "curve": curve_table(run.response),

@@ -13,6 +13,7 @@ import torch
 
 from sehdr_warp.errors import InputError, UsageError
 from sehdr_warp.model.baking import field_of
+from sehdr_warp.model.pixel_filter import FocalRange
 from sehdr_warp.output.export.commands import Export, run_export
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.export.splat_edits import SplatEdits
@@ -168,3 +169,22 @@ def test_gaussians_beyond_the_picture_are_drawn_as_ours_are(tmp_path):
         exposure = as_array(run.render(camera).hdr) * run.base_time
         error = pixels(page, "#picture") - as_array(run.response.encode(torch.as_tensor(exposure)))
         assert exposure.max() > 0.1 and -10 * np.log10(np.mean(error**2)) > 38
+
+
+@pytest.mark.parametrize(("focal", "antialiased"), [(75.0, False), (600.0, False), (None, False), (None, True)])
+def test_lamps_smaller_than_a_pixel_keep_their_light(tmp_path, focal, antialiased):
+    """The page is four times larger than the photos, half as large, of photos that are not known, and compensated."""
+    places = np.random.default_rng(0).uniform(-1, 1, (60, 3)) * (1.2, 0.8, 1)
+    lamps = replace(splats(places, np.full(60, 0.6), scale=0.004), color_model="linear", antialiased=antialiased)
+    lamps.harmonics[:, 0] = 2.0
+    field = field_of(lamps)
+    field.photo_focals = focal and FocalRange(focal, focal)
+    scene = Splats(tmp_path / "lamps", field, (Entry("0", "train", camera()),))
+    file = write_scene_page(scene, tmp_path / "lamps.html")
+    with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
+        page.wait_for_selector(FULL)
+        seen = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
+        shown = pixels(page, "#picture")
+        rendered = scene.render_ldr(seen).numpy()
+        assert seen.fx == pytest.approx(300)
+        assert -10 * np.log10(np.mean((shown - rendered) ** 2)) > 50

@@ -4,7 +4,7 @@
 const $ = id => document.getElementById(id);
 const facts = JSON.parse($("facts").textContent), light = new LightCanvas($("picture")), camera = new FlyingCamera(facts.up);
 const stage = $("stage"), STILL_AFTER = 160, DRAFT_TIME = 60;
-let app, eye, color, target, sorted = 0, wanted = null, busy = false, timer = 0, scale = 0.5;
+let app, eye, material, color, target, sorted = 0, wanted = null, busy = false, timer = 0, scale = 0.5;
 
 async function start() {
   if (!light.gl) throw new Error("this browser has no WebGL2, by which the scene is drawn");
@@ -34,7 +34,8 @@ async function start() {
   splat.addComponent("gsplat", {unified: false});
   splat.gsplat.resource = new pc.GSplatResource(device, new pc.GSplatData([{name: "vertex", count, properties}]));
   app.root.addChild(splat);
-  asOurs(splat.gsplat.instance.material, pc.ShaderChunks.get(device, pc.SHADERLANGUAGE_GLSL));
+  material = splat.gsplat.instance.material;
+  asOurs(material, pc.ShaderChunks.get(device, pc.SHADERLANGUAGE_GLSL));
   eye = new pc.Entity();
   // As far as the engine knows its colors are encoded, and it leaves them as they are.
   eye.addComponent("camera", {clearColor: new pc.Color(0, 0, 0, 1), toneMapping: pc.TONEMAP_NONE, gammaCorrection: pc.GAMMA_SRGB});
@@ -49,7 +50,9 @@ const opening = () => facts.opening || facts.views[facts.first].camera;
 
 // The engine's Gaussians end early, are lifted to make up for it, are left out where small, shrunk where larger than the
 // picture, and drawn at any nearness; ours end at the same opacity alone and behind the near plane. Both linearize the
-// projection, ours no farther outside of the picture than a margin.
+// projection, ours no farther outside of the picture than a margin. The engine's low-pass filter has a fourth of our
+// variance, because its lengths are half pixels. Here it is the photos' filter (see pixel_filter.py) and at least a
+// pixel's, and opacities keep the light that the photos' filter gives.
 function asOurs(material, chunks) {
   const change = (name, from, to) => {
     const own = material.getShaderChunks(pc.SHADERLANGUAGE_GLSL), before = own.get(name) || chunks.get(name), after = before.replace(from, to);
@@ -61,8 +64,12 @@ function asOurs(material, chunks) {
   change("gsplatCornerVS", "float vmin = min(1024.0, min(viewport_size.x, viewport_size.y));", "float vmin = 1e9;\n\tif (center.proj.w < camera_params.z) return false;");
   change("gsplatCornerVS", "vec2 J2 = -J1 / vp.z * vp.xy;",
     `vec2 at = clamp(center.proj.xy / center.proj.w, ${-1 - facts.margin}, ${1 + facts.margin}) + matrix_projection[2].xy;\n\t\tvec2 J2 = J1 * at / vec2(center.projMat00, center.projMat11);`);
+  change("gsplatCornerVS", "uniform float minPixelSize;", "uniform float minPixelSize;\nuniform float photoFilter, pixelFilter;");
+  change("gsplatCornerVS", /cov(\[.\])\1 \+ 0\.3/g, "cov$1$1 + pixelFilter");
+  change("gsplatCornerVS", "detOrig = cov[0][0] * cov[1][1]", "detOrig = (cov[0][0] + photoFilter) * (cov[1][1] + photoFilter)");
   change("gsplatCornerVS", "vec2(offDiagonal, lambda1 - diagonal1)", "vec2(offDiagonal + 1e-12, lambda1 - diagonal1)");  // Not (0, 0)
   material.setParameter("minPixelSize", 0);
+  material.setDefine("GSPLAT_AA", true);
   material.update();
 }
 
@@ -83,6 +90,9 @@ function place(c) {  // The engine's camera: OpenGL axes, +y up and +z back
   eye.camera.nearClip = near, eye.camera.farClip = far;
   eye.camera.calculateProjection = matrix => matrix.set([2 * c.fx / c.width, 0, 0, 0, 0, 2 * c.fy / c.height, 0, 0,
     1 - 2 * c.cx / c.width, 2 * c.cy / c.height - 1, -(far + near) / (far - near), -1, 0, 0, -2 * far * near / (far - near), 0]);
+  const variance = facts.photo_eps2d * (c.fx / Math.min(Math.max(c.fx, facts.focals[0]), facts.focals[1])) ** 2;
+  material.setParameter("photoFilter", 4 * variance);
+  material.setParameter("pixelFilter", 4 * Math.max(variance, facts.eps2d));
 }
 
 function moved() {
