@@ -23,6 +23,7 @@ from ..splats.arrays import HARMONIC_0, GaussianArrays, colors_of_basis, harmoni
 from .adam import Adam
 from .color_models import rec709_of
 from .gaussians import Gaussians
+from .pixel_filter import FocalRange, photo_filters
 from .radiance_field import RadianceField
 
 log = logging.getLogger(__name__)
@@ -57,7 +58,10 @@ def field_of(gaussians: GaussianArrays) -> RadianceField:
     model = Gaussians(means, log_scales, quaternions, logits, harmonics[:, :1], harmonics[:, 1:])
     options = {"base_time": gaussians.base_time, "color_model": gaussians.color_model}
     options |= {"normalization": Normalization(center), "antialiased": gaussians.antialiased}
-    return RadianceField(model, response_by_name("srgb"), **options).requires_grad_(False)
+    options |= {"photo_focals": gaussians.photo_focals and FocalRange(*gaussians.photo_focals)}
+    field = RadianceField(model, response_by_name("srgb"), **options).requires_grad_(False)
+    field.photo_filters = gaussians.filters
+    return field
 
 
 def gaussians_of(
@@ -85,6 +89,13 @@ def gaussians_of(
     return to_scene(arrays, field.normalization)
 
 
+def with_photo_filters(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> GaussianArrays:
+    """Return Gaussians with the filters of their training cameras, unless they have some or were compensated."""
+    if gaussians.filters is not None or gaussians.photo_focals is None or not cameras:
+        return gaussians
+    return replace(gaussians, filters=photo_filters(gaussians.means, cameras))
+
+
 def to_normalized(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:
     """Return Gaussians of scene coordinates in normalized ones."""
     return _transform(gaussians, normalization.points(gaussians.means), -math.log(normalization.unit))
@@ -100,7 +111,8 @@ def to_scene(gaussians: GaussianArrays, normalization: Normalization) -> Gaussia
 def _transform(gaussians: GaussianArrays, means: np.ndarray, log_scale: float) -> GaussianArrays:
     """Return Gaussians at other means [N, 3] float64, with sizes multiplied by exp(log_scale)."""
     sizes = (gaussians.log_scales.astype(np.float64) + log_scale).astype(np.float32)
-    return replace(gaussians, means=rounded_means(means, sizes), log_scales=sizes)
+    filters = None if gaussians.filters is None else gaussians.filters * np.float32(math.exp(log_scale))
+    return replace(gaussians, means=rounded_means(means, sizes), log_scales=sizes, filters=filters)
 
 
 def _in_colors(
@@ -145,6 +157,7 @@ def _arrays_of(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
     harmonics = np.concatenate([tensors.pop("harmonics_dc"), tensors.pop("harmonics_rest")], axis=1)
     name = field.color_model.name
     facts = {"color_model": name, "base_time": field.base_time, "antialiased": field.antialiased}
+    facts |= {"photo_focals": None if field.antialiased else field.photo_focals, "filters": field.photo_filters}
     gaussians = GaussianArrays(**tensors, harmonics=harmonics, **facts)
     if field.color_model.display_referred:
         return gaussians, lambda encoded: field.response.decode(np.clip(encoded, 0, 1)) / field.base_time

@@ -6,9 +6,10 @@ small Gaussians shrink, and a lamp loses most of its light. With a shorter one i
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -46,6 +47,31 @@ class FocalRange(NamedTuple):
         """Return the variance of the photos' filter in square pixels of a render with a focal length in pixels."""
         ratio = focal / self.nearest(focal)
         return EPS2D if abs(ratio - 1) < ROUNDING else EPS2D * ratio**2
+
+
+def photo_filters(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the standard deviations [N] of the photos' filter where Gaussians are, in scene units.
+
+    It is the geometric mean of those of the cameras that have the place in their picture, or that of the nearest camera
+    if none has. A round Gaussian as large as a camera's filter covers the area of that filter.
+
+    Args:
+        means: [N, 3] scene coordinates.
+        cameras: Training cameras, one or more.
+    """
+    count, logarithms, nearest = np.zeros(len(means)), np.zeros(len(means)), np.full(len(means), np.inf)
+    for camera in cameras:
+        distance = np.maximum(np.linalg.norm(means - camera.position, axis=1), NEAR)
+        pixel, inside = distance / math.sqrt(camera.fx * camera.fy), np.ones(len(means), bool)
+        nearest = np.minimum(nearest, pixel)
+        if camera.is_pinhole:
+            projected = camera.project(means)
+            # A pixel covers depth^3 / (distance fx fy) of a sphere about the camera at this distance.
+            inside, pixel = projected.inside, pixel * np.nan_to_num(projected.depth / distance, nan=1.0) ** 1.5
+        count += inside
+        logarithms += np.where(inside, np.log(pixel), 0)
+    pixels = np.where(count > 0, np.exp(logarithms / np.maximum(count, 1)), nearest)
+    return (math.sqrt(EPS2D) * pixels).astype(np.float32)
 
 
 def keep_light(

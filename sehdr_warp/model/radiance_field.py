@@ -32,11 +32,13 @@ class RadianceField(nn.Module):
         clipped_stops: [N], uncertainty of each Gaussian's clipped light, see Evidence; None if it was not measured.
         photo_focals: Focal lengths of the photos, with which renders of another resolution keep the light of small
             Gaussians; None in a training, and if they are not known.
+        photo_filters: [N] filters of GaussianArrays, as a file states them; None of a run, whose cameras state them.
         rasterizer: rasterize(); benchmarks set a function with the same arguments.
     """
 
     confidence: Tensor | None
     clipped_stops: Tensor | None
+    photo_filters: np.ndarray | None = None
     rasterizer: Callable[..., Rendering] = staticmethod(rasterize)
 
     def __init__(

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ..errors import SehdrError, refuse_paths
-from ..model.baking import field_of, gaussians_of
-from ..runs.run import RenderableScene, on_device, photo_focals
+from ..model.baking import field_of, gaussians_of, with_photo_filters
+from ..runs.run import RenderableScene, on_device
 from ..splats import GaussianArrays
 from ..splats.arrays import join_gaussians
 from .cameras.scene_cameras import camera_positions, training_cameras
@@ -39,8 +39,6 @@ class MergedScene(RenderableScene):
         field.confidence, field.clipped_stops = (
             _joined([getattr(scene.field, name) for scene in scenes]) for name in ("confidence", "clipped_stops")
         )
-        if all(scene.field.photo_focals for scene in scenes):
-            field.photo_focals = photo_focals(self.cameras)
         self.field = on_device(field, first.device)
         self.degree = self.field.gaussians.degree
         self._clipped = _joined([scene.clipped_share() for scene in scenes])
@@ -62,15 +60,11 @@ def merge_scenes(run: RenderableScene, *others: RenderableScene) -> MergedScene:
         others: Further ones.
 
     Raises:
-        SehdrError: If some scenes were trained with opacity compensation and others without, because they are
-            rendered in different ways.
+        SehdrError: If some scenes are rendered with opacity compensation, as small files are, and the low-pass filter
+            of another one is not known, which would have to be included in its sizes.
     """
     refuse_paths("load_run", run, *others)
     scenes = (run, *others)
-    if len({scene.field.antialiased for scene in scenes}) > 1:
-        plain = next(scene.path for scene in scenes if not scene.field.antialiased)
-        problem = "was trained without opacity compensation (model.antialiased), unlike another scene to merge"
-        raise SehdrError(f"{plain}: {problem}; train all of them alike")
     return MergedScene(scenes)
 
 
@@ -93,7 +87,14 @@ def _joined_gaussians(scenes: Sequence[RenderableScene], moves: Sequence[WorldTr
     for scene, move in zip(scenes, moves, strict=True):
         positions = camera_positions(training_cameras(scene))
         gaussians = gaussians_of(scene.field, color_model, positions, time, scene.color_matrix)
+        gaussians = with_photo_filters(gaussians, training_cameras(scene))
         parts.append(gaussians if move.is_identity else gaussians.transformed(move.matrix))
+    if any(part.antialiased for part in parts):
+        parts = [part.with_filter() for part in parts]
+        for scene, part in zip(scenes, parts, strict=True):
+            if not part.antialiased:
+                problem = "was trained without opacity compensation (model.antialiased), unlike another scene to merge"
+                raise SehdrError(f"{scene.path}: {problem}; train all of them alike")
     return join_gaussians(parts)
 
 

@@ -128,7 +128,7 @@ def read_gaussians(path: Path | str) -> GaussianArrays:
 
 
 def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: bool = False) -> None:
-    """Write a file of one of FORMATS.
+    """Write a file of one of FORMATS; sizes there include the photos' filter, if it is known (see with_filter).
 
     Raises:
         InputError: If a value is NaN or infinite (with field and index), the file exists (unless overwrite), or the
@@ -141,7 +141,7 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
         raise InputError(path, problem, "choose another suffix, or let export change the colors")
     gaussians.require_finite(path)
     # Text of a NumPy scalar is not that of a number.
-    gaussians = replace(gaussians, base_time=float(gaussians.base_time))
+    gaussians = replace(gaussians.with_filter(), base_time=float(gaussians.base_time))
     if gaussians.means.dtype == np.float64:
         far = float(np.abs(gaussians.means).max())
         log.warning(

@@ -22,6 +22,7 @@ SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
 _MOST_LOGIT = 20.0
 # Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.
 _MOST_LOG_SCALE = 20.0
+_LEAST_VARIANCE = 1e-6  # Part of a size's variance that remains without the filter, where float32 holds no less
 _COARSE = 1e-3  # Of the size of Gaussians: larger errors of float32 positions keep them in float64
 
 
@@ -41,8 +42,11 @@ class GaussianArrays:
         base_time: Seconds at which the scene was photographed; for display colors, the exposure time of the photo that
             they show.
         world_matrix: [4, 4] float64 from the photos' coordinates to these; None if they are the same.
-        antialiased: Trained with opacity compensation (gsplat's mode "antialiased", "mip" in PLY): renderers of the
-            common mode show small Gaussians brighter than they were trained.
+        antialiased: To be rendered with opacity compensation (gsplat's mode "antialiased", "mip" in PLY): renderers of
+            the common mode show small Gaussians brighter.
+        filters: [N] standard deviations of the low-pass filter of the photos where the Gaussians are, in the unit of
+            the means; see with_filter(). None if they are not known.
+        photo_focals: Least and largest focal length of the photos, pixels; None if they are not known.
     """
 
     means: np.ndarray
@@ -54,6 +58,8 @@ class GaussianArrays:
     base_time: float
     world_matrix: np.ndarray | None = None
     antialiased: bool = False
+    filters: np.ndarray | None = None
+    photo_focals: tuple[float, float] | None = None
 
     @property
     def count(self) -> int:
@@ -84,6 +90,38 @@ class GaussianArrays:
         rotations = Rotation.from_quat(self.unit_quaternions, scalar_first=True).as_matrix()
         return np.sqrt(np.einsum("nij,nj->ni", rotations**2, np.exp(2 * self.log_scales.astype(np.float64))))
 
+    def with_filter(self) -> "GaussianArrays":
+        """Return a copy whose sizes include the low-pass filter of the photos, as files hold them.
+
+        In a training the rasterizer widens what it projects by this filter. At other sizes of a picture its filter is
+        another part of the scene, and small Gaussians lose their light or gain some. With the filter in their sizes
+        they keep it in renderers that have no filter or compensate opacities, and nearly in others, if they do not
+        render coarser pictures than the photos (after the 3D smoothing filter of Yu et al. 2024; opacities stay,
+        because those of the training were not compensated).
+        """
+        if self.filters is None or self.antialiased:
+            return self
+        variances = np.exp(2 * self.log_scales.astype(np.float64)) + np.square(self.filters, dtype=np.float64)[:, None]
+        return replace(self, log_scales=(0.5 * np.log(variances)).astype(np.float32), antialiased=True)
+
+    @property
+    def filter_shares(self) -> np.ndarray | None:
+        """Filters [N] that sizes include, over the smallest size, below 1; None if sizes include none.
+
+        A ratio stays true in a file that another program scales.
+        """
+        if self.filters is None or not self.antialiased:
+            return None
+        return self.filters / np.exp(self.log_scales.min(axis=1))
+
+    def without_filter(self, shares: np.ndarray) -> "GaussianArrays":
+        """Return a copy without the filter that sizes include, which with_filter() included; see filter_shares."""
+        variances = np.exp(2 * self.log_scales.astype(np.float64))
+        filters = np.clip(shares, 0, 1) * np.sqrt(variances.min(axis=1))
+        variances = np.maximum(variances - np.square(filters)[:, None], _LEAST_VARIANCE * variances)
+        log_scales = (0.5 * np.log(variances)).astype(np.float32)
+        return replace(self, log_scales=log_scales, antialiased=False, filters=filters.astype(np.float32))
+
     def with_colors(self, harmonics: np.ndarray, color_model: str) -> "GaussianArrays":
         """Return a copy with other harmonics and color model."""
         return replace(self, harmonics=np.ascontiguousarray(harmonics, np.float32), color_model=color_model)
@@ -113,11 +151,13 @@ class GaussianArrays:
             quaternions=turned.as_quat(scalar_first=True).astype(np.float32),
             harmonics=rotate_harmonics(self.harmonics, rotation),
             world_matrix=matrix @ before,
+            filters=None if self.filters is None else self.filters * np.float32(scale),
         )
 
     def rows(self, index: np.ndarray) -> "GaussianArrays":
         """Return the Gaussians at an index or mask [N]."""
-        return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
+        filters = None if self.filters is None else self.filters[index]
+        return replace(self, filters=filters, **{name: getattr(self, name)[index] for name in _ARRAYS})
 
     def checked(self, path: Path | str) -> "GaussianArrays":
         """Return a copy without Gaussians that are not finite.
@@ -155,21 +195,25 @@ class GaussianArrays:
 _ARRAYS = tuple(field.name for field in fields(GaussianArrays))[:5]
 
 
-def warn_of_compensation(path: Path, antialiased: bool, statement: str) -> None:
-    """Warn of Gaussians that were trained with opacity compensation, as a file states it."""
+def log_compensation(path: Path, antialiased: bool, statement: str) -> None:
+    """Log that a file states opacity compensation."""
     if antialiased:
-        log.warning(
-            "%s: was trained with opacity compensation (%s), and is rendered with it; programs without it, like most "
-            "viewers, show its small Gaussians too bright; PLY, SPZ and SOG keep the mark, other formats cannot",
-            *(path, statement),
-        )
+        text = "%s: states opacity compensation (%s), and is rendered with it; without it small Gaussians are brighter"
+        log.info(text, path, statement)
 
 
 def join_gaussians(parts: Sequence[GaussianArrays]) -> GaussianArrays:
     """Return several sets of Gaussians in one space, of one color model and exposure, as one of the largest degree."""
     degree = max(part.degree for part in parts)
     padded = [part.padded(degree) for part in parts]
-    return replace(padded[0], **{name: np.concatenate([getattr(part, name) for part in padded]) for name in _ARRAYS})
+    filters = [part.filters for part in parts if part.filters is not None]
+    least, most = zip(*(part.photo_focals or (0.0, 0.0) for part in parts), strict=True)
+    return replace(
+        padded[0],
+        filters=np.concatenate(filters) if len(filters) == len(parts) else None,
+        photo_focals=(min(least), max(most)) if all(least) else None,
+        **{name: np.concatenate([getattr(part, name) for part in padded]) for name in _ARRAYS},
+    )
 
 
 def rounded_means(means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
@@ -189,6 +233,24 @@ def degree_of(coefficients: float, path: Path) -> int:
         problem = f"has {coefficients:.4g} harmonics for each channel, not 1, 4, 9 or 16"
         raise InputError(path, problem, "export it with degree 0 to 3")
     return degree
+
+
+def read_focals(value: Any, path: Path) -> tuple[float, float] | None:
+    """Return stored photo_focals, which may be JSON text or numbers; None for None.
+
+    Raises:
+        InputError: If they are not two positive numbers, the smaller one first.
+    """
+    if value is None:
+        return None
+    try:
+        low, high = map(float, json.loads(value) if isinstance(value, str) else value)
+    except (TypeError, ValueError, RecursionError):
+        low, high = math.nan, math.nan
+    if not 0 < low <= high < math.inf:
+        problem = f"its focal lengths of the photos are {value!s:.60}, not two positive numbers in order"
+        raise InputError(path, problem, "export it again")
+    return low, high
 
 
 def read_matrix(value: Any, path: Path) -> np.ndarray | None:

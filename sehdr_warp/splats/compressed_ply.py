@@ -13,7 +13,7 @@ from .packing import from_smallest_three, logits, morton_order, smallest_three
 
 SUFFIX = ".compressed.ply"
 MIP = "SplatRenderMode: mip"
-"""Comment of Gaussians that were trained with opacity compensation."""
+"""Comment of Gaussians that are to be rendered with opacity compensation."""
 _CHUNK = 256
 _LIMITS = ("x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b")
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -71,6 +71,8 @@ def write_compressed_ply(path: Path, gaussians: GaussianArrays, overwrite: bool)
 def header_comments(gaussians: GaussianArrays) -> list[str]:
     """Return the comments of a PLY header that state what its properties do not."""
     facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(gaussians.base_time)}
+    if gaussians.photo_focals is not None:
+        facts["photo_focals"] = json.dumps(gaussians.photo_focals)
     if gaussians.world_matrix is not None:
         facts["world_matrix"] = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
     return [*(f"sehdr:{name} {value}" for name, value in facts.items()), *[MIP] * gaussians.antialiased]

@@ -15,10 +15,11 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import HARMONIC_0, GaussianArrays, degree_of, join_gaussians, read_matrix
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, join_gaussians, read_focals, read_matrix
 
 log = logging.getLogger(__name__)
 EXTENSION = "KHR_gaussian_splatting"
+_FILTER = "_SEHDR_FILTER"  # Attribute of filter_shares; programs have their own behind an underscore.
 _SPACE = "srgb_rec709_display"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _POINTS, _VERTICES = 5126, 0, 34962
@@ -39,6 +40,8 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         f"{EXTENSION}:SCALE": np.exp(gaussians.log_scales),
         f"{EXTENSION}:OPACITY": gaussians.opacities[:, None],
     }
+    if (shares := gaussians.filter_shares) is not None:
+        attributes[_FILTER] = shares[:, None]
     attributes |= {name: gaussians.harmonics[:, i] for i, name in enumerate(_harmonic_names(gaussians.degree))}
     blobs = [np.ascontiguousarray(values, "<f4").tobytes() for values in attributes.values()]
     views, accessors, offset = [], [], 0
@@ -57,6 +60,8 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         "extensions": {EXTENSION: extension},
     }
     extras: dict[str, Any] = {"base_exposure_time": gaussians.base_time}
+    if gaussians.photo_focals is not None:
+        extras["photo_focals"] = list(gaussians.photo_focals)
     if gaussians.world_matrix is not None:
         extras["world_matrix"] = gaussians.world_matrix.tolist()
     described = {
@@ -127,7 +132,7 @@ def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path
         logits = np.log(opacities) - np.log1p(-opacities)
     if are_logarithms:
         log.warning("%s: its SCALE has negative numbers and is read as logarithms, as SplatTransform wrote it", path)
-    return GaussianArrays(
+    gaussians = GaussianArrays(
         means=values("POSITION", 3),
         log_scales=log_scales,
         quaternions=np.roll(values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
@@ -136,7 +141,9 @@ def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path
         color_model="display",
         base_time=float(extras.get("base_exposure_time", 1.0)),
         world_matrix=read_matrix(extras.get("world_matrix"), path),
+        photo_focals=read_focals(extras.get("photo_focals"), path),
     )
+    return gaussians.without_filter(values(_FILTER, 1)[:, 0]) if _FILTER in attributes else gaussians
 
 
 def _scene_meshes(described: dict, path: Path) -> list[tuple[int, np.ndarray]]:

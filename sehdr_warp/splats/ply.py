@@ -5,6 +5,9 @@ blue), opacity (logit), scale_0..2 (logarithm), rot_0..3 (w x y z). The color mo
 `comment sehdr:...` lines of the header; a file without them holds display colors. Two more habits are read: the
 smoothing filter of Mip-Splatting (filter_3D), and the comment `SplatRenderMode: mip` of gsplat, nerfstudio and Brush.
 So are 8-bit colors in place of f_dc (red, green, blue), as nerfstudio writes them on demand.
+
+Viewers read no normals, and strict ones no property more. So nx holds the filter that sizes include (filter_shares) if
+the header states the focal lengths of the photos.
 """
 
 import io
@@ -25,8 +28,9 @@ from .arrays import (
     SHORTEST_TIME,
     GaussianArrays,
     degree_of,
+    log_compensation,
+    read_focals,
     read_matrix,
-    warn_of_compensation,
 )
 from .compressed_ply import MIP, header_comments, unpack_ply
 
@@ -47,9 +51,10 @@ def write_ply(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     from plyfile import PlyData, PlyElement
 
     rest = gaussians.harmonics[:, 1:].swapaxes(1, 2).reshape(gaussians.count, -1)
+    filters = np.zeros(gaussians.count) if (shares := gaussians.filter_shares) is None else shares
     parts = {
         "x y z": gaussians.means,
-        "nx ny nz": np.zeros((gaussians.count, 3)),
+        "nx ny nz": filters[:, None] * [1, 0, 0],
         "f_dc_0 f_dc_1 f_dc_2": gaussians.harmonics[:, 0],
         " ".join(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
         "opacity": gaussians.opacity_logits[:, None],
@@ -79,6 +84,7 @@ def read_ply(path: Path) -> GaussianArrays:
         names = {each.name for each in vertex.properties}
         if "packed_position" in names:
             facts = _facts(read.comments, path)._replace(color_model="display")
+            log_compensation(path, facts.antialiased, MIP)
             return GaussianArrays(**unpack_ply(read, path), **facts._asdict())
         flat = "scale_2" not in names and {"scale_0", "scale_1", "rot_3"} <= names
         bytes_ = {each.name for each in vertex.properties if each.val_dtype == "u1"}
@@ -119,7 +125,12 @@ def read_ply(path: Path) -> GaussianArrays:
     higher = higher.reshape(len(means), 3, len(rest) // 3).swapaxes(1, 2)
     harmonics = np.concatenate([constant[:, None], higher], axis=1)
     arrays = means, log_scales, quaternions, opacity[:, 0], harmonics
-    return GaussianArrays(*arrays, **_facts(read.comments, path)._asdict())
+    facts = _facts(read.comments, path)
+    gaussians = GaussianArrays(*arrays, **facts._asdict())
+    if facts.antialiased and facts.photo_focals is not None and "nx" in names:
+        return gaussians.without_filter(np.asarray(vertex["nx"], np.float32))
+    log_compensation(path, facts.antialiased, MIP)
+    return gaussians
 
 
 def _read(path: Path):
@@ -196,6 +207,7 @@ class _Facts(NamedTuple):
     base_time: float
     world_matrix: np.ndarray | None
     antialiased: bool
+    photo_focals: tuple[float, float] | None
 
 
 def _facts(comments: list[str], path: Path) -> _Facts:
@@ -212,5 +224,5 @@ def _facts(comments: list[str], path: Path) -> _Facts:
             path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a time of {SHORTEST_TIME} to {LONGEST_TIME} s"
         )
     antialiased = any(re.fullmatch(r"SplatRenderMode:\s*mip", line.strip(), re.IGNORECASE) for line in comments)
-    warn_of_compensation(path, antialiased, MIP)
-    return _Facts(color_model, base_time, read_matrix(facts.get("world_matrix"), path), antialiased)
+    matrix, focals = read_matrix(facts.get("world_matrix"), path), read_focals(facts.get("photo_focals"), path)
+    return _Facts(color_model, base_time, matrix, antialiased, focals)

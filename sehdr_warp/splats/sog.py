@@ -20,7 +20,7 @@ from PIL import Image
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import GaussianArrays, read_matrix, warn_of_compensation
+from .arrays import GaussianArrays, log_compensation, read_matrix
 from .packing import CODES, codebook, from_smallest_three, logits, morton_order, palette, smallest_three
 
 _LARGEST_PALETTE, _PER_ENTRY, _ACROSS = 1 << 14, 2, 64  # Entries; Gaussians for each; entries side by side
@@ -137,7 +137,7 @@ def read_sog(path: Path) -> GaussianArrays:
             return archive.read(above + name)
 
         gaussians = gaussians_of_files(read, path)
-    warn_of_compensation(path, gaussians.antialiased, "its meta.json says antialias")
+    log_compensation(path, gaussians.antialiased, "its meta.json says antialias")
     return gaussians
 
 

@@ -14,10 +14,11 @@ import numpy as np
 from ..errors import InputError, SehdrError, require_extra
 from ..files import atomic_path
 from ..sandbox import read_sandboxed
-from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_matrix
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_focals, read_matrix
 
 COLOR_SPACE = "lin_rec709_scene"
 _BASE_TIME, _WORLD_MATRIX = "sehdr:baseExposureTime", "sehdr:worldMatrix"
+_FILTER, _FOCALS = "sehdr:filter", "sehdr:photoFocals"  # filter_shares and photo_focals of GaussianArrays
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _BIAS = 0.5 / HARMONIC_0
 _FAINTEST = 1 / 255  # Opacity below which programs draw nothing of a Gaussian
@@ -82,6 +83,10 @@ def _write_stage(path: Path, gaussians: GaussianArrays) -> None:
     if gaussians.world_matrix is not None:
         matrix = pxr("Gf").Matrix4d(gaussians.world_matrix.T.tolist())  # USD's matrices act on row vectors.
         prim.CreateAttribute(_WORLD_MATRIX, Sdf.ValueTypeNames.Matrix4d, True).Set(matrix)
+    if gaussians.photo_focals is not None:
+        prim.CreateAttribute(_FOCALS, Sdf.ValueTypeNames.DoubleArray, True).Set(list(gaussians.photo_focals))
+    if (shares := gaussians.filter_shares) is not None:
+        prim.CreateAttribute(_FILTER, Sdf.ValueTypeNames.FloatArray, True).Set(_array("FloatArray", shares))
     harmonics = gaussians.harmonics.astype(np.float32, copy=True)
     harmonics[:, 0] -= _BIAS
     splat.CreatePositionsAttr(_array("Vec3fArray", gaussians.means))
@@ -124,7 +129,7 @@ def read_usd(path: Path) -> GaussianArrays:
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
     matrix = read_matrix(arrays["world_matrix"], path)
-    return GaussianArrays(
+    gaussians = GaussianArrays(
         means=means,
         log_scales=log_scales,
         quaternions=quaternions,
@@ -133,7 +138,9 @@ def read_usd(path: Path) -> GaussianArrays:
         color_model="linear",
         base_time=float(arrays["base_time"]),
         world_matrix=None if np.array_equal(matrix, np.eye(4)) else matrix,  # pyright: ignore[reportArgumentType]
+        photo_focals=read_focals(arrays.get("focals"), path),
     )
+    return gaussians.without_filter(values(_FILTER, 1)[:, 0]) if _FILTER in arrays else gaussians
 
 
 def usd_arrays(path: Path) -> dict[str, Any]:
@@ -153,7 +160,9 @@ def usd_arrays(path: Path) -> dict[str, Any]:
         "world_matrix": np.array(world.Get()).T if (world := prim.GetAttribute(_WORLD_MATRIX)) else np.eye(4),
         "base_time": float(prim.GetAttribute(_BASE_TIME).Get()) if prim.HasAttribute(_BASE_TIME) else 1.0,
     }
-    for name in ("positions", "scales", "orientations", "opacities", _HARMONICS):
+    if prim.HasAttribute(_FOCALS):
+        arrays["focals"] = np.array(prim.GetAttribute(_FOCALS).Get(), np.float64)
+    for name in ("positions", "scales", "orientations", "opacities", _HARMONICS, _FILTER):
         for value in filter(None, (_value(prim.GetAttribute(each)) for each in (f"{name}h", name))):
             arrays[name] = np.array(value, np.float32)
     return arrays

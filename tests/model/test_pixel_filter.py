@@ -11,7 +11,7 @@ import torch
 from sehdr_warp import Camera, load_run
 from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
-from sehdr_warp.model.pixel_filter import FocalRange, keep_light
+from sehdr_warp.model.pixel_filter import FocalRange, keep_light, photo_filters
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.model.renders import CameraTensors, RenderedView
 from sehdr_warp.output.averaging import render_averaged
@@ -76,6 +76,49 @@ def test_opacity_times_area_stays():
 
     new_opacities = keep_light(opacities, means, log_scales, quaternions, camera, 0.05)
     torch.testing.assert_close(new_opacities * area(EPS2D), opacities * area(0.05), rtol=1e-9, atol=0)
+
+
+def test_the_filter_of_photos_is_the_mean_of_cameras_that_show_a_place_or_of_the_nearest():
+    near, far = (replace(PHOTO, world_to_camera=pose_at(depth)) for depth in (2.0, 8.0))
+    pixel = math.sqrt(EPS2D) / 40
+    middle, behind = np.array([[0.0, 0, 0]]), np.array([[0.0, 0, -9.0]])
+    np.testing.assert_allclose(photo_filters(middle, [far]), 8 * pixel, rtol=1e-6)
+    np.testing.assert_allclose(photo_filters(middle, [far, near]), 4 * pixel, rtol=1e-6)
+    aside = replace(near, cx=500.0)
+    np.testing.assert_allclose(photo_filters(middle, [far, aside]), 8 * pixel, rtol=1e-6)
+    np.testing.assert_allclose(photo_filters(behind, [far, near]), pixel, rtol=1e-6)
+    np.testing.assert_allclose(photo_filters(middle, [replace(FISHEYE, world_to_camera=pose_at(3.0))]), 3 * pixel)
+
+
+def pose_at(depth):
+    """A camera that far in front of the origin."""
+    pose = np.eye(4)
+    pose[2, 3] = depth
+    return pose
+
+
+def test_a_round_gaussian_covers_the_area_of_the_filter_anywhere_in_a_photo():
+    places = np.array([[0.0, 0, 2], [1.1, 0.8, 2], [-1.1, 0.1, 2]])
+    filters = torch.from_numpy(photo_filters(places, [PHOTO])).double()
+    pose, intrinsics = torch.eye(4, dtype=torch.float64), torch.from_numpy(PHOTO.intrinsics)
+    quaternions, opacities = torch.tensor([[1.0, 0, 0, 0]] * 3).double(), torch.full((3,), 0.5).double()
+    sizes = filters.log()[:, None].expand(3, 3)
+    arguments = (
+        torch.from_numpy(places),
+        sizes,
+        quaternions,
+        opacities,
+        pose,
+        intrinsics,
+        48,
+        36,
+        0.01,
+        0.0,
+        1e-9,
+        False,
+    )
+    a, b, c = project_reference(*arguments)[1].unbind(1)
+    torch.testing.assert_close(1 / (a * c - b * b).sqrt(), torch.full((3,), EPS2D).double(), rtol=1e-4, atol=0)
 
 
 def test_pictures_of_half_the_size_are_means_of_the_photos_pixels(embedded_run):

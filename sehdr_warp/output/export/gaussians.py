@@ -12,7 +12,7 @@ import numpy as np
 
 from ...errors import InputError, SehdrError, refuse_paths
 from ...files import atomic_path
-from ...model.baking import agreement, field_of, gaussians_of, refine
+from ...model.baking import agreement, field_of, gaussians_of, refine, with_photo_filters
 from ...response import response_by_name
 from ...runs.run import on_device
 from ...scene import Camera
@@ -106,6 +106,7 @@ def export(
     means = run.field.gaussians.means.detach().cpu().numpy()
     edits.check_regions(for_edits.points(run.field.normalization.scene_points(means)))  # Before minutes of fitting
     whole = _gaussians_in_colors(run, "display" if kind == "ldr" else hdr_model, display_time)
+    whole = with_photo_filters(whole, training_cameras(run))
     mask = edits.mask(whole.opacities, for_edits.points(whole.means), run)
     part = _select_rows(run, whole, mask, edits, display_time)
     written = part if to_file.is_identity else part.transformed(to_file.matrix)

@@ -212,6 +212,7 @@ def without_strays(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> Gaus
         gaussians,
         means=(center + offsets * factor[:, None]).astype(gaussians.means.dtype),
         log_scales=(gaussians.log_scales + np.log(factor)[:, None]).astype(np.float32),
+        filters=None if gaussians.filters is None else (gaussians.filters * factor).astype(np.float32),
     )
     text = "strays: %d Gaussians beyond %.3g units: %d faint ones left out, %d moved there"
     log.info(text, far.sum(), limit, faint.sum(), (far & ~faint).sum())

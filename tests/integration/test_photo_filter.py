@@ -1,0 +1,105 @@
+"""Files hold the low-pass filter of the photos in their sizes, so that lamps keep their light in other programs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.model.baking import field_of
+from sehdr_warp.model.pixel_filter import FocalRange
+from sehdr_warp.output.export.gaussians import export
+from sehdr_warp.output.merged_scene import merge_scenes
+from sehdr_warp.runs.run import Splats, load_splats
+from sehdr_warp.splats import read_gaussians, write_gaussians
+
+from ..output.export.test_splat_edits import splats
+from ..output.helpers import Entry, camera
+from ..splats.test_splat_files import LOSSY_SUFFIXES
+
+VIEW = camera(96, 72)
+LOSSLESS_SUFFIXES = (".ply", ".glb", ".usdc")
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Lamps of a fifth of a pixel, of photos of 96 x 72 pixels."""
+    places = np.random.default_rng(0).uniform(-1, 1, (60, 3)) * (0.9, 0.6, 0.5)
+    lamps = replace(splats(places, np.full(60, 0.6), scale=0.012), color_model="display", photo_focals=(40.0, 40.0))
+    lamps.harmonics[:, 0] = 0.9
+    entries = tuple(Entry(str(x), "train", camera(96, 72, position=(x, 0, -3))) for x in (-0.5, 0.0, 0.5))
+    return Splats(tmp_path / "run", field_of(lamps), entries)
+
+
+def as_other_programs_read(path, monkeypatch):
+    """Return what a file holds for a program that does not know of the filter."""
+    with monkeypatch.context() as patch:
+        patch.setattr("sehdr_warp.splats.arrays.GaussianArrays.without_filter", lambda gaussians, _: gaussians)
+        return replace(read_gaussians(path), photo_focals=None, filters=None)
+
+
+def light(gaussians, scale, antialiased):
+    field = field_of(replace(gaussians, antialiased=antialiased))
+    return float(field.render_ldr(VIEW.resized(round(96 * scale), round(72 * scale))).mean())  # Viewers add colors
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", *LOSSY_SUFFIXES])
+def test_lamps_keep_their_light_in_other_programs(tmp_path, run, monkeypatch, suffix):
+    file = export(run, tmp_path / f"lamps{suffix}", axes="scene")
+    gaussians = as_other_programs_read(file, monkeypatch)
+    gaussians = replace(gaussians, base_time=run.base_time)  # SPZ does not state it.
+    trained = float(run.render_ldr(VIEW).mean())
+    plain = replace(read_gaussians(export(run, tmp_path / "plain.ply", axes="scene")), photo_focals=None)
+    assert light(plain, 4, antialiased=False) < 0.2 * trained, "what happens without"
+    for scale in (1, 2, 4):
+        assert light(gaussians, scale, antialiased=True) == pytest.approx(trained, rel=0.06)
+    assert light(gaussians, 2, antialiased=False) == pytest.approx(1.25 * trained, rel=0.06)
+    assert light(gaussians, 4, antialiased=False) == pytest.approx(trained, rel=0.08)
+
+
+@pytest.mark.parametrize("suffix", LOSSLESS_SUFFIXES)
+def test_the_program_reads_the_gaussians_of_the_training(tmp_path, run, suffix):
+    scene = load_splats(export(run, tmp_path / f"a{suffix}", axes="scene"))
+    assert scene.field.photo_focals == FocalRange(40.0, 40.0) and not scene.field.antialiased
+    sizes, trained = (each.field.gaussians.log_scales.numpy() for each in (scene, run))
+    np.testing.assert_allclose(sizes, trained, atol=1e-3)
+    again = load_splats(export(scene, tmp_path / "again.ply", axes=None))  # Without cameras
+    np.testing.assert_allclose(again.field.gaussians.log_scales.numpy(), trained, atol=1e-3)
+    np.testing.assert_allclose(again.field.photo_filters, scene.field.photo_filters, rtol=1e-4)
+
+
+def test_a_file_that_another_program_scales_is_read_alike(tmp_path, run, monkeypatch):
+    file = export(run, tmp_path / "a.ply", axes="scene")
+    scaled = as_other_programs_read(file, monkeypatch).transformed(np.diag([10.0, 10, 10, 1]))
+    shares = replace(read_gaussians(file)).with_filter().filter_shares
+    np.testing.assert_allclose(np.exp(scaled.without_filter(shares).log_scales), 0.12, rtol=1e-3)
+
+
+def test_strange_focal_lengths_are_refused(tmp_path, run):
+    file = export(run, tmp_path / "a.ply", axes="scene")
+    data = file.read_bytes()
+    file.write_bytes(data.replace(b"photo_focals [40.0, 40.0]", b"photo_focals [40.0, 0.00]"))
+    with pytest.raises(InputError, match="focal lengths of the photos are .* not two positive numbers"):
+        read_gaussians(file)
+
+
+def test_gaussians_of_compensated_trainings_are_written_as_they_are(tmp_path, run):
+    run.field.antialiased = True
+    read = read_gaussians(export(run, tmp_path / "a.ply", axes="scene"))
+    assert read.antialiased and read.filters is None
+    np.testing.assert_allclose(np.exp(read.log_scales), 0.012, rtol=1e-4)
+
+
+def test_a_small_file_and_a_run_are_merged_with_the_filter_of_both(tmp_path, run):
+    small = load_splats(export(run, tmp_path / "small.sog", axes="scene"))
+    merged = merge_scenes(run, small)
+    assert merged.field.antialiased and merged.gaussian_count == 120
+    sizes = merged.field.gaussians.log_scales.exp()
+    np.testing.assert_allclose(np.sort(sizes[:60], axis=0), np.sort(sizes[60:], axis=0), rtol=0.05)
+
+
+def test_files_without_known_photos_are_written_as_they_are(tmp_path, run):
+    write_gaussians(tmp_path / "a.ply", splats([(0, 0, 0)], [0.6], scale=0.012))
+    converted = read_gaussians(export(load_splats(tmp_path / "a.ply"), tmp_path / "b.glb", axes=None))
+    assert converted.filters is None and not converted.antialiased
+    np.testing.assert_allclose(np.exp(converted.log_scales), 0.012, rtol=1e-4)
