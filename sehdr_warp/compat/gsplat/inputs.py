@@ -126,6 +126,8 @@ def split_views(
         )
         shapes["backgrounds"] = (backgrounds, (*batch, "C", channels))
     check_tensors(**shapes)
+    if covars is not None:  # gsplat reads the upper triangle alone, so only that gets a gradient.
+        covars = covars.flatten(-2)[..., (0, 1, 2, 1, 4, 5, 2, 5, 8)].unflatten(-1, (3, 3))
     if colors is not None and sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
         raise ValueError(
             f"colors has shape {list(colors.shape)}, but sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} "

@@ -53,6 +53,20 @@ def test_covariances_and_cameras_are_projected_alike(model, device):
     assert torch.autograd.gradcheck(conics, few, eps=1e-6, atol=1e-5, rtol=1e-3)
 
 
+def test_the_upper_triangle_of_covariances_is_read_alone(device):
+    """As gsplat does: the lower one changes nothing and gets no gradient."""
+    leaves, place = scene(device, count=12)
+    symmetric = quat_scale_to_covar_preci(leaves[1], leaves[2])[0].detach()
+    upper = symmetric.triu().requires_grad_()
+    images = [
+        rasterization(leaves[0], None, None, *leaves[3:], **place._asdict(), covars=covars)[0]
+        for covars in (symmetric, upper)
+    ]
+    assert torch.equal(*images)
+    images[1].square().sum().backward()
+    assert bool((upper.grad.triu(1) != 0).any()) and not bool(upper.grad.tril(-1).any())
+
+
 @pytest.mark.parametrize("model", ["pinhole", "fisheye"])
 def test_a_negative_near_plane_shows_nothing_behind_the_camera(model, device):
     leaves, place = scene(device, count=12)
