@@ -6,6 +6,7 @@ from itertools import accumulate
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
 from .warp_launch.threads import torch_threads
 
@@ -55,7 +56,7 @@ def kernel_layout(gradient: Tensor) -> Tensor:
 @cache
 def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return a shared vector of these values, which nobody may change."""
-    with torch.inference_mode(False):  # The vector outlives the caller's mode.
+    with torch.inference_mode(False), _disable_current_modes():  # The vector outlives the caller's modes.
         return torch.tensor(values, dtype=dtype, device=device)
 
 

@@ -44,10 +44,11 @@ def torch_operation(function: Callable[P, T], *, compiles: bool = False) -> Call
     - torch.compile calls what register_compiled() named if it `compiles`. Else it calls the operation as it is: the
       graph breaks there, nothing inside is traced.
     - Under torch.autocast, half-precision tensors become float32, as torch.amp.custom_fwd(cast_inputs=...) does.
-    - torch.func transforms and forward-mode differentiation are refused by a sentence.
+    - torch.func transforms, forward-mode differentiation and torch.jit.trace() are refused by a sentence.
 
     Raises:
-        NotImplementedError: within torch.func transforms, and for dual tensors of forward-mode differentiation.
+        NotImplementedError: within torch.func transforms and torch.jit.trace(), and for dual tensors of forward-mode
+            differentiation.
     """
     name = function.__name__
 
@@ -57,6 +58,8 @@ def torch_operation(function: Callable[P, T], *, compiles: bool = False) -> Call
             return _compiled[name](*args, **kwargs)  # Registered by custom_ops.py, which the package imports.
         if _transforms_are_active():
             raise NotImplementedError(f"{name}() does not support torch.func; use torch.autograd")
+        if torch._C._is_tracing():
+            raise NotImplementedError(f"{name}() cannot be traced by torch.jit; use torch.compile or torch.export")
         if forward_ad._current_level >= 0 and any(map(_has_tangent, (*args, *kwargs.values()))):
             raise NotImplementedError(f"{name}() has no forward-mode derivative; use torch.autograd.grad()")
         if torch._C._is_any_autocast_enabled():

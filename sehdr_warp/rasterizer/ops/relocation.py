@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
 from ...kernels import relocation as kernels
 from ..warp_launch.launching import launch
@@ -115,4 +116,5 @@ def relocation_sums(device: torch.device) -> Tensor:
         [math.comb(n, k + 1) * (-1) ** k / math.sqrt(k + 1) if k < n else 0.0 for k in range(MOST_COPIES)]
         for n in range(1, MOST_COPIES + 1)
     ]
-    return torch.tensor(rows, dtype=torch.float64, device=device)
+    with _disable_current_modes():  # The sums outlive the caller's modes.
+        return torch.tensor(rows, dtype=torch.float64, device=device)

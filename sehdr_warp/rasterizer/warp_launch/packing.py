@@ -107,7 +107,10 @@ class PackedLaunch:
                 ):
                     write_layout(array, value, self.kinds[index], self._label(index))
                     packed[index] = _Layout(shape, strides, dtype)
-                array.data = value.data_ptr()
+                array.data = address = value.data_ptr()
+                if not address and value.numel():
+                    kind = type(value).__name__
+                    raise TypeError(f"{self._label(index)} is a {kind}, which has no memory; pass a plain tensor")
             elif value is not packed[index] and (value is None or value != packed[index]):
                 if value is not None:
                     self._set(index, value)

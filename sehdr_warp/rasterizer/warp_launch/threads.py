@@ -17,6 +17,7 @@ from typing import Any
 import torch
 import warp as wp
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
 from ...kernels import shared_ranges
 from ...parallel import thread_count
@@ -115,7 +116,8 @@ def single_range(count: int) -> Tensor:
 
 @lru_cache
 def _even_ranges(count: int, pieces: int) -> Tensor:
-    return torch.arange(pieces + 1, device="cpu").mul(count).div(pieces, rounding_mode="floor").int()
+    with _disable_current_modes():  # The ranges outlive the caller's modes, such as FakeTensorMode.
+        return torch.arange(pieces + 1, device="cpu").mul(count).div(pieces, rounding_mode="floor").int()
 
 
 @contextmanager
