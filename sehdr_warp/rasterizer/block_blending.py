@@ -32,9 +32,8 @@ def blend_on_cuda(
     launch_blocks(kernel, lists, blend_cuda.BLOCKS_PER_TILE, *arguments)
     # Padded features take more memory. The backward pass pads those of many Gaussians again.
     features = padded if keeps_padded or len(features) <= MAX_SINGLE_SORT else features
-    packed = packed._replace(padded=None)
     return BlockBackward(
-        features, image.shape[-1], lists, packed, transmittance, arguments[-1], alpha_threshold, deterministic
+        features, image.shape[-1], lists, packed[:2], transmittance, arguments[-1], alpha_threshold, deterministic
     )
 
 
@@ -42,14 +41,15 @@ def blend_on_cuda(
 class BlockBackward:
     """The backward pass of blend_on_cuda(); see blending.py.
 
-    features: [N, C] or, padded, [N, more]. transmittance: [H, W], the result. last_contributor: [H W] int32, 1 + the
-    index of a pixel's last Gaussian in its tile's list, or 0.
+    features: [N, C] or, padded, [N, more]. ellipses: the first two of PackedSplats, all of it that is still read.
+    transmittance: [H, W], the result. last_contributor: [H W] int32, 1 + the index of a pixel's last Gaussian in its
+    tile's list, or 0.
     """
 
     features: Tensor
     channels: int
     lists: TileLists
-    packed: PackedSplats
+    ellipses: tuple[Tensor, Tensor]
     transmittance: Tensor
     last_contributor: Tensor
     alpha_threshold: float
@@ -117,7 +117,8 @@ class BlockBackward:
         return blend_cuda_backward.backward_kernel(scalar, self.channels, self.deterministic, self._cuda)
 
     def _arguments(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> tuple:
-        inputs = _inputs(pad_features(self.features), self.lists, self.packed, self.transmittance, self.alpha_threshold)
+        padded = pad_features(self.features)
+        inputs = _inputs(padded, self.lists, self.ellipses, self.transmittance, self.alpha_threshold)
         outputs_and_gradients = self.transmittance, self.last_contributor, grad_image, grad_transmittance
         return *inputs, *outputs_and_gradients, blend_cuda_backward.LINES, self.channels + 6
 
@@ -147,17 +148,17 @@ def _forward(padded, lists, packed, image, transmittance, alpha_threshold) -> tu
     """Return the forward kernel and its arguments, of which the last is BlockBackward.last_contributor."""
     kernel = blend_cuda.forward_kernel(warp_scalar(padded.dtype), image.shape[2], padded.device.type == "cuda")
     last_contributor = torch.empty(transmittance.numel(), dtype=torch.int32, device=padded.device)
-    inputs = _inputs(padded, lists, packed, transmittance, alpha_threshold)
+    inputs = _inputs(padded, lists, packed[:2], transmittance, alpha_threshold)
     return kernel, (*inputs, image, transmittance, last_contributor)
 
 
-def _inputs(padded, lists, packed, transmittance, alpha_threshold) -> tuple[Any, ...]:
+def _inputs(padded, lists, ellipses, transmittance, alpha_threshold) -> tuple[Any, ...]:
     """Return the arguments that both kernels take first."""
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     height, width = transmittance.shape
     return (
-        *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, packed.means_opacities, packed.conics_cutoffs),
-        *(padded.reshape(-1, 4), lists.grid.columns, width, height, alpha_threshold),
+        *(lists.tile_ranges, lists.gaussians, lists.subtile_masks, *ellipses, padded.reshape(-1, 4)),
+        *(lists.grid.columns, width, height, alpha_threshold),
     )
 
 
