@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from .values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     from ..response import Response
-    from ..scene import Scene, View
+    from ..scene import Camera, Scene, View
     from ..scene.dataparser import PlacedPhoto
     from .config import Config
     from .run import Run, Splats
@@ -96,7 +96,8 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
     response = response_for_loading(run.config, run.response)
     cameras = known_cameras(run.cameras)
     scene = load_scene_and_log_notes(run.data | {"path": place}, response=response, cameras=cameras)
-    scene = with_saved_splits(_with_saved_poses(scene, run, place), run.cameras)
+    saved = {entry.name: entry.camera for entry in run.cameras}
+    scene = with_saved_splits(in_world_of_run(scene, saved, run.field.normalization.unit, run.path, place), run.cameras)
     times = {entry.name: entry.exposure_time for entry in run.cameras}
     views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
     scene = replace(scene, views=tuple(views))
@@ -120,20 +121,29 @@ def known_cameras(entries: Iterable[CameraEntry]) -> list[PlacedPhoto]:
     return [entry.placed for entry in entries if entry.placed is not None]
 
 
-def _with_saved_poses(scene: Scene, run: Run, place: str) -> Scene:
-    """Return a scene with the poses that a run was trained with, and views that the run lacks in the same world.
+def in_world_of_run(
+    scene: Scene, cameras: Mapping[str, Camera], unit: float, run: Path | str, place: Path | str
+) -> Scene:
+    """Return a scene with the poses of a run's cameras, by the views' names; other views and points in the same world.
 
-    Poses that are found anew are turned, moved and scaled as a whole by chance.
+    Poses that structure from motion finds anew are turned, moved and scaled as a whole.
 
-    Raises InputError if views differ otherwise from those of their names in the run.
+    Args:
+        scene: The scene, as it was loaded.
+        cameras: Cameras of the run, in scene coordinates.
+        unit: Length of the run's normalized coordinates, in those of the scene.
+        run: Folder of the run, to name in the error.
+        place: Folder of the photos, to name in the error.
+
+    Raises:
+        InputError: If cameras differ otherwise from those of the run.
     """
     import numpy as np
 
-    saved = {entry.name: entry.camera for entry in run.cameras}
-    views = [view for view in scene.views if view.name in saved]
-    if not views:
+    views = [view for view in scene.views if view.name in cameras]
+    pairs = [(view.camera, cameras[view.name]) for view in views]
+    if all(np.array_equal(new.world_to_camera, old.world_to_camera) for new, old in pairs):
         return scene
-    pairs = [(view.camera, saved[view.name]) for view in views]
     turns = np.stack([old.world_to_camera[:3, :3].T @ new.world_to_camera[:3, :3] for new, old in pairs])
     u, _, vt = np.linalg.svd(turns.sum(0))
     turn = u @ vt
@@ -142,25 +152,26 @@ def _with_saved_poses(scene: Scene, run: Run, place: str) -> Scene:
     spread = np.linalg.norm(found - found.mean(0))
     scale = np.linalg.norm(known - known.mean(0)) / spread if spread else 1.0
     shift = known.mean(0) - scale * found.mean(0)
-    distances = np.linalg.norm(scale * found + shift - known, axis=1) / run.field.normalization.unit
+    distances = np.linalg.norm(scale * found + shift - known, axis=1) / unit
     zooms = np.array([new.fx / new.width * old.width / old.fx for new, old in pairs])
     unlike = (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED) | (np.abs(zooms - 1) > _MOST_ZOOMED)
     if unlike.any():
-        problem = f"{unlike.sum()} of {len(views)} photos have other cameras than {run.path} was trained with"
+        problem = f"{unlike.sum()} of {len(views)} photos have other cameras than {run} was trained with"
         remedy = "put photos and cameras back as they were then, or train again"
         names = first_names([view.name for view, is_other in zip(views, unlike, strict=True) if is_other])
         raise InputError(place, f"{problem}: {names}", remedy)
 
     def with_pose(view: View) -> View:
-        if view.name in saved:
-            pose = saved[view.name].world_to_camera
+        if view.name in cameras:
+            pose = cameras[view.name].world_to_camera
         else:
             pose = view.camera.world_to_camera.copy()
             pose[:3, :3] = pose[:3, :3] @ turn.T
             pose[:3, 3] = -pose[:3, :3] @ (scale * turn @ view.camera.position + shift)
         return replace(view, camera=replace(view.camera, world_to_camera=pose))
 
-    return replace(scene, views=tuple(map(with_pose, scene.views)))
+    points = scale * scene.points @ turn.T + shift
+    return replace(scene, views=tuple(map(with_pose, scene.views)), points=points)
 
 
 def with_saved_splits(scene: Scene, cameras: Iterable[CameraEntry]) -> Scene:

@@ -17,13 +17,14 @@ from .values import FORMAT
 GRID = 8
 _MOST_ROWS = 32
 """Rows that are read of each row of cells; more would take longer for large photos and find little more."""
+FOUND = "photos", "video"
+"""Layouts of sets whose cameras structure from motion finds."""
 _TOLERANCE = 2
 """Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded."""
 
 
 def describe_scene(scene: Scene) -> dict:
     """Return what scene.json holds."""
-    found = scene.format in ("photos", "video")  # Cameras that structure from motion found
     views = [
         {name: getattr(view, name) for name in ("name", "split", "exposure_time")}
         | {
@@ -31,7 +32,7 @@ def describe_scene(scene: Scene) -> dict:
             "has_hdr": view.hdr is not None,
             "photo": photo_signature(view.codes, view.mask),
         }
-        | (_lens_values(view) if found else {})
+        | (_lens_values(view) if scene.format in FOUND else {})
         for view in scene.views
     ]
     facts = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
@@ -54,11 +55,18 @@ class SceneDifference(NamedTuple):
 
 
 def scene_difference(saved: dict, current: dict) -> SceneDifference | None:
-    """Return what differs between two descriptions of describe_scene(); None if they are of the same scene."""
+    """Return what differs between two descriptions of describe_scene(); None if they are of the same scene.
+
+    Focal lengths that structure from motion found are not compared: in_world_of_run() does, with a tolerance.
+    """
     saved, current = (json.loads(json.dumps(description)) for description in (saved, current))
     photos, current_photos = _split_photos(saved), _split_photos(current)
     if saved.get("layout") != current["layout"]:
         return SceneDifference("layout", False)
+    if current["layout"] in FOUND:
+        for view in (*saved["views"], *current["views"]):
+            for name in ("fx", "fy", "cx", "cy"):
+                view["camera"].pop(name, None)
     if saved["views"] != current["views"]:
         return SceneDifference(_differing_part(saved["views"], current["views"]), False)
     if changed := changed_photos(photos, current_photos):

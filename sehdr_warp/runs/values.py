@@ -122,6 +122,7 @@ class CheckpointValues(Values):
     seconds: _Seconds
     sha256: str
     run: Annotated[dict[str, str], Field(default_factory=dict)]
+    large_scene: bool | None = None
 
 
 class RegionValues(Values):

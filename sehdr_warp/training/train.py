@@ -16,11 +16,13 @@ from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config, require_same_config, with_iterations_of
 from ..runs.device import pick_device
+from ..runs.open import in_world_of_run
 from ..runs.run import Run, exposure_compensation, field_from_checkpoint
 from ..runs.run_writer import RunWriter
+from ..runs.scene_description import FOUND
 from ..runs.values import LoadArguments
 from ..scene import Scene
-from ..scene.normalization import normalization_of
+from ..scene.normalization import Normalization, normalization_of
 from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from .following import send_training, several_ranks_notes
 from .initialization import brighten_clipped, make_field, make_matcher, response_for_training, sizes_of
@@ -173,6 +175,7 @@ def _resumed_trainer(
         config = _with_decisions(config, saved, folder)
         saved = override_config(saved, {"schedule.iterations": max(before, config.schedule.iterations)})
         require_same_config(config, saved, folder.config_file, "resume with the run's own config, or train anew")
+    scene = _in_world_of_run(scene, folder, info)
     folder.check_same_scene(scene)
     checkpoint = folder.newest_checkpoint()
     if checkpoint is None:
@@ -180,7 +183,8 @@ def _resumed_trainer(
     field = field_from_checkpoint(checkpoint, saved, info).to(device)
     compensation = exposure_compensation(info)
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
-    trainer = Trainer(scene, saved, field, ranks=ranks, output=output)
+    large_scene = checkpoint.values.get("large_scene")
+    trainer = Trainer(scene, saved, field, ranks=ranks, output=output, large_scene=large_scene)
     try:
         load_state(trainer, checkpoint)
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
@@ -192,6 +196,15 @@ def _resumed_trainer(
         log.info(text, before, trainer.total)
     folder.rewind_metrics(trainer.iteration)
     return trainer
+
+
+def _in_world_of_run(scene: Scene, folder: RunWriter, info: dict[str, Any]) -> Scene:
+    """Return a scene with the cameras of a run if structure from motion found them; the Gaussians are in its world."""
+    if scene.format not in FOUND:
+        return scene
+    cameras = {entry.name: entry.camera for entry in folder.read_cameras()}
+    unit = Normalization.from_dict(info.get("normalization")).unit
+    return in_world_of_run(scene, cameras, unit, folder.path, scene.name)
 
 
 def _with_decisions(config: Config, saved: Config, folder: RunWriter) -> Config:

@@ -76,6 +76,7 @@ class Trainer:
         iteration: Iterations done; a step on several ranks counts one for each photo.
         first_iteration: Iterations done before this process.
         total: Iterations in all.
+        large_scene: Whether photos show little of the scene, see scene_facts.is_large().
         batch: Photos of a step, one for each rank; each counts as an iteration.
         step_batch: Photos of the last step: `batch`, or as many as iterations were left.
         seconds: Duration so far, without evaluation, renders for figures that are shown, and checkpoints.
@@ -90,11 +91,13 @@ class Trainer:
         get_matcher: Callable[[], Matcher] | None = None,
         ranks: Ranks | None = None,
         output: RunOutput | None = None,
+        large_scene: bool | None = None,
     ):
         """Prepare a training on the device of the field; create_trainer() does this for a scene and a run folder.
 
         `config` is that after the plan. get_matcher() returns the matcher of the training photos that seeding uses,
-        by default a new one. `ranks` train together.
+        by default a new one. `ranks` train together. `large_scene` is that of a training that goes on, whose scene may
+        lack points; by default scene_facts.is_large() of the scene.
         """
         self.scene, self.config, self.field, self.ranks, self.output = scene, config, field, ranks, output
         rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)
@@ -107,8 +110,8 @@ class Trainer:
         self.optimizer = make_optimizer(field, config, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in views)
         positions = torch.tensor([view.camera.position.tolist() for view in views], device=self.device)
-        large_scene = is_large(scene)
-        self.strategy = make_strategy(config, pixels, positions, large_scene=large_scene)
+        self.large_scene = is_large(scene) if large_scene is None else large_scene
+        self.strategy = make_strategy(config, pixels, positions, large_scene=self.large_scene)
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.order = PhotoOrder(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
@@ -118,7 +121,7 @@ class Trainer:
         self._get_matcher: Callable[[], Matcher] | None = get_matcher or make
 
         field.gaussians.release()  # Another trainer of this field may have reserved rows for its own optimizer.
-        self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, ranks, large_scene)
+        self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, ranks, self.large_scene)
         use_cuda_graph = config.schedule.use_cuda_graph
         self.graphs = StepGraphs(self.gradient_step, enabled=use_cuda_graph, deterministic=config.deterministic)
         self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)

@@ -41,6 +41,7 @@ def state_of(trainer: Trainer) -> TrainingState:
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
     counts = {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
     values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining} | counts
+    values["large_scene"] = trainer.large_scene
     return TrainingState(tensors, values)
 
 

@@ -20,7 +20,9 @@ from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.scene.readers import bare_photos
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
+from sehdr_warp.scene.sfm import reconstruction
 from sehdr_warp.scene.sfm.reconstruction import Reconstruction
+from sehdr_warp.training.train import create_trainer
 from tests.refusals import call, refused
 from tests.training.toy import toy_scene
 
@@ -140,18 +142,33 @@ def test_photos_of_another_place_are_refused(bare_run, tmp_path, capfd):
     assert "holds none of the 9 photos that the run was trained with" in error
 
 
-def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, monkeypatch, capfd):
-    """Cameras of a run whose scene.json has no lenses are found anew."""
-    _, run, cameras = bare_run
-    scene_file, checkpoints = run / "scene.json", run / "checkpoints"
+def without_lenses(run):
+    """Turn the files of a run into those of an older one, whose cameras are found anew."""
+    scene_file = run / "scene.json"
     scene = json.loads(scene_file.read_text())
     for view in scene["views"]:
         assert view.pop("lens")
     scene_file.write_text(json.dumps(scene))
-    for file in checkpoints.glob("*/checkpoint.json"):
+    for file in run.glob("checkpoints/*/checkpoint.json"):
         values = json.loads(file.read_text())
         values["run"]["scene.json"] = RunFolder(run).hashes()["scene.json"]
         file.write_text(json.dumps(values))
+
+
+TURN = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
+
+
+def in_other_world(camera):
+    """The camera in a world that is turned, three times as large and moved."""
+    pose = camera.world_to_camera.copy()
+    pose[:3, :3] = pose[:3, :3] @ TURN.T
+    pose[:3, 3] = -pose[:3, :3] @ (3 * TURN @ camera.position + [1, 2, 3])
+    return replace(camera, world_to_camera=pose)
+
+
+def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, monkeypatch, capfd):
+    _, run, cameras = bare_run
+    without_lenses(run)
     assert call("eval", run, "--device", "cpu", "-q") == 0
     moved = {}
     for name, camera in cameras.items():
@@ -159,39 +176,82 @@ def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, mo
         pose[:3, 3] *= 1 + 0.2 * len(moved)
         moved[name] = replace(camera, world_to_camera=pose)
     find_cameras(monkeypatch, moved)
-    error = refused(capfd, "eval", run, "--device", "cpu")
-    assert "9 of 9 photos have other cameras than" in error
-    assert "its cameras differ" in refused(capfd, "train", "--resume", "--out", run, "--iterations", 40)
+    for command in (["eval", run, "--device", "cpu"], ["train", "--resume", "--out", run, "--iterations", 40]):
+        assert "9 of 9 photos have other cameras than" in refused(capfd, *command)
+
+
+def test_an_older_run_goes_on_in_its_world_if_structure_from_motion_finds_another(bare_run, monkeypatch, tmp_path):
+    """The Gaussians that are trained further, and figures before and after, are those of the same world."""
+    folder, run, cameras = bare_run
+    without_lenses(run)
+    saved, same = (run / "scene.json").read_bytes(), tmp_path / "same"
+    shutil.copytree(run, same)
+    other = {name: in_other_world(camera) for name, camera in cameras.items()}
+    zoomed = {name: replace(camera, fx=1.0001 * camera.fx) for name, camera in other.items()}
+    results = []
+    for place, found in ((same, cameras), (run, zoomed)):
+        find_cameras(monkeypatch, found)
+        assert call("train", "--resume", "--out", place, "--iterations", 40, "--device", "cpu") == 0
+        results.append(load_run(place))
+    first, second = (result.field.gaussians.means.detach().numpy() for result in results)
+    assert first.shape == second.shape
+    np.testing.assert_allclose(first, second, atol=0.02)
+    assert (run / "scene.json").read_bytes() == saved
+    scores = [result.metrics()[-1]["psnr_ldr"] for result in results]
+    assert abs(scores[0] - scores[1]) < 0.2, scores
+    trainer = create_trainer(load_scene(folder, max_size=40, response="srgb"), run, resume=True, device="cpu")
+    np.testing.assert_array_equal(
+        [view.camera.world_to_camera for view in trainer.scene.views],
+        [entry.camera.world_to_camera for entry in RunFolder(run).read_cameras()],
+    )
 
 
 def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_the_run():
     """Structure from motion turns the world by chance; one camera that moved, turned or zoomed is named."""
     scene = toy_scene(6, 8)
-    run = SimpleNamespace(path="run", field=SimpleNamespace(normalization=Normalization(unit=4.0)))
-    run.cameras = [CameraEntry(view.name, "train", view.camera, 1.0) for view in scene.views]
-    angle, views = np.radians(20), []
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    for view in scene.views:
-        pose = view.camera.world_to_camera.copy()
-        pose[:3, :3] = pose[:3, :3] @ turn.T
-        pose[:3, 3] = -pose[:3, :3] @ (3 * turn @ view.camera.position + [1, 2, 3])
-        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
-    aligned = opening._with_saved_poses(replace(scene, views=tuple(views)), run, "photos")
-    for view, entry in zip(aligned.views, run.cameras, strict=True):
-        np.testing.assert_array_equal(view.camera.world_to_camera, entry.camera.world_to_camera)
-    run.cameras = run.cameras[:-1]  # A photo that was added since is placed in the world of the run.
-    added = opening._with_saved_poses(replace(scene, views=tuple(views)), run, "photos").views[-1].camera
+    cameras = {view.name: view.camera for view in scene.views}
+    views = [replace(view, camera=in_other_world(view.camera)) for view in scene.views]
+    points = 3 * scene.points @ TURN.T + [1, 2, 3]
+    found = replace(scene, views=tuple(views), points=points)
+    aligned = opening.in_world_of_run(found, cameras, 4.0, "run", "photos")
+    for view in aligned.views:
+        np.testing.assert_array_equal(view.camera.world_to_camera, cameras[view.name].world_to_camera)
+    np.testing.assert_allclose(aligned.points, scene.points, atol=1e-12)
+    assert opening.in_world_of_run(scene, cameras, 4.0, "run", "photos") is scene
+    del cameras[scene.views[-1].name]  # A photo that was added since is placed in the world of the run.
+    added = opening.in_world_of_run(found, cameras, 4.0, "run", "photos").views[-1].camera
     np.testing.assert_allclose(added.world_to_camera, scene.views[-1].camera.world_to_camera, atol=1e-12)
     first = views[0].camera
     moved, turned = first.world_to_camera.copy(), first.world_to_camera.copy()
     moved[:3, 3] += 0.5
-    turned[:3, :3] = turned[:3, :3] @ turn
+    turned[:3, :3] = turned[:3, :3] @ TURN
     turned[:3, 3] = -turned[:3, :3] @ first.position
     changes = [{"world_to_camera": moved}, {"world_to_camera": turned}, {"fx": 1.01 * first.fx, "fy": 1.01 * first.fy}]
     for change in changes:
-        other = replace(views[0], camera=replace(first, **change))
+        changed = replace(views[0], camera=replace(first, **change))
         with pytest.raises(InputError, match="of 5 photos have other cameras than run was trained with: v_0"):
-            opening._with_saved_poses(replace(scene, views=(other, *views[1:])), run, "photos")
+            opening.in_world_of_run(replace(scene, views=(changed, *views[1:])), cameras, 4.0, "run", "photos")
+
+
+def test_the_castle_goes_on_if_its_cameras_are_found_again(tmp_path, shared, monkeypatch):
+    """Structure from motion runs twice, with photos in another order: it turns the world otherwise."""
+    photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
+    (tmp_path / "photos").mkdir()
+    for photo in photos:
+        with Image.open(photo) as image:
+            image.reduce(4).save(tmp_path / "photos" / photo.name, exif=image.getexif(), quality=95)
+    run, options = tmp_path / "run", ["--device", "cpu", "--iterations"]
+    monkeypatch.setenv("SEHDR_CACHE", str(tmp_path / "first"))
+    assert call("train", tmp_path / "photos", "--out", run, *TRAIN.replace("40", "100").split(), *options[2:], 30) == 0
+    without_lenses(run)
+    before = load_run(run)
+    monkeypatch.setenv("SEHDR_CACHE", str(tmp_path / "second"))
+    seed = reconstruction.SEED
+    monkeypatch.setattr(reconstruction, "SEED", seed + 1)
+    assert call("train", "--resume", "--out", run, *options, 60) == 0
+    after = load_run(run)
+    assert after.iterations == 60
+    assert after.metrics()[-1]["psnr_ldr"] > before.metrics()[-1]["psnr_ldr"]
 
 
 @pytest.mark.parametrize("name", ["gpu", "mps", "cuda:99"])

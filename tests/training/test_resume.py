@@ -3,8 +3,10 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -46,6 +48,17 @@ def test_resume_is_exact(scene, trained, tmp_path, variant):
     again = train(blind, tmp_path / "killed", VARIANTS[variant], device="cpu", resume=True)
     assert torch.equal(run.field.gaussians.means, again.field.gaussians.means) and run.metrics() == again.metrics()
     assert again.summary() == before
+
+
+def test_a_large_scene_stays_one_in_a_training_that_goes_on_without_its_points(scene, tmp_path):
+    """Bare photos of a run are loaded with its cameras, without the points by which a scene counts as large."""
+    points = np.random.default_rng(0).uniform([-1, -1, 19], [1, 1, 21], (2000, 3))  # Above all photos
+    large = replace(without_truth(scene), points=points, point_colors=np.full((2000, 3), 0.5, np.float32))
+    bare = replace(large, points=points[:0], point_colors=large.point_colors[:0])
+    create_trainer(large, tmp_path / "large", quick(), device="cpu")
+    create_trainer(bare, tmp_path / "bare", quick(), device="cpu")
+    resumed = (create_trainer(bare, tmp_path / name, device="cpu", resume=True) for name in ("large", "bare"))
+    assert [trainer.large_scene for trainer in resumed] == [True, False]
 
 
 def test_a_run_begins_with_a_checkpoint_of_its_start(scene, trained, tmp_path):
