@@ -21,9 +21,10 @@ from ..files import read_json, refuse_links, write_json
 from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_from_dict, field_and_problem, override_config
-from ..runs.open import load_scene_and_log_notes
+from ..runs.open import in_world_of_run, load_scene_and_log_notes, response_for_loading
+from ..runs.scene_description import FOUND
 from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationValues
-from ..scene import Scene, View
+from ..scene import Camera, Scene, View
 from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.normalization import Normalization, normalization_of
 from ..subsets import every_nth
@@ -83,6 +84,7 @@ class BlockPlanValues(BaseModel):
     exposure_compensation: GainValues | None
     exposure_times: dict[str, Annotated[float, Field(gt=0)]]
     photo_bytes: dict[str, Annotated[int, Field(ge=0)]] = {}
+    cameras: dict[str, dict[str, Any]] = {}
     config: dict[str, Any]
     axes: Annotated[list[Annotated[list[FiniteFloat], _THREE]], _THREE]
     blocks: Annotated[list[Block], Field(min_length=1)]
@@ -99,6 +101,7 @@ class BlockPlan:
     shared: SharedDecisions  # Base time and exposure compensation
     exposure_times: Mapping[str, float]  # By view, seconds, before the compensation
     photo_bytes: Mapping[str, int]  # By view, size of its photo's file, by which nodes with other photos are found
+    cameras: Mapping[str, Camera]  # By view, if structure from motion found them: all blocks are in their world
     config: Config  # Requested options of each block, before its own plan
     axes: np.ndarray  # [3, 3] rows are the axes of the cells in scene coordinates
     blocks: tuple[Block, ...]  # The blocks
@@ -110,7 +113,12 @@ class BlockPlan:
         return Division(self.axes, tuple(block.cell for block in self.blocks), margins, ())
 
     def config_of(self, block: Block) -> Config:
-        """Return the config of a block: its part of the budget of Gaussians."""
+        """Return the config of a block: its part of the budget of Gaussians.
+
+        The budget is that of the requested mcmc.cap_density, 120 by default, on a GPU too. The plan of a training with
+        many photos doubles the default (training.plan.GPU_CAP_DENSITY) and leaves the smaller value of a block; only a
+        block that has all photos is planned as one training.
+        """
         root, fields = math.sqrt(block.fraction), {}
         # These are multiples of the root of the block's pixels, and the budget of the set is divided by its pixels.
         for path in ("mcmc.cap_density", "model.initial_density"):
@@ -119,6 +127,19 @@ class BlockPlan:
         if "densification.cap_max" in self.config.plan.keep:
             fields["densification.cap_max"] = max(1, round(self.config.densification.cap_max * block.fraction))
         return override_config(self.config, fields, block.name)
+
+    def load_scene(self, names: list[str], photo_storage: str) -> Scene:
+        """Load views of the set with the plan's response, exposure times and world.
+
+        Raises:
+            InputError: If they cannot be read, or have other cameras than when the set was divided.
+        """
+        response = response_for_loading(self.config, self.response)
+        scene = load_scene_and_log_notes(self.data | {"views": names}, response=response, photo_storage=photo_storage)
+        place = self.data.get("path") or self.scene
+        scene = in_world_of_run(scene, self.cameras, self.normalization.unit, "the set", place)
+        views = tuple(replace(view, exposure_time=self.exposure_times[view.name]) for view in scene.views)
+        return replace(scene, views=views)
 
     def check_photos(self, views: Sequence[View]) -> None:
         """Raise InputError if the files of photos are not those of the plan."""
@@ -141,6 +162,7 @@ class BlockPlan:
             "exposure_compensation": None if compensation is None else compensation.to_dict(),
             "exposure_times": dict(self.exposure_times),
             "photo_bytes": dict(self.photo_bytes),
+            "cameras": {name: camera.to_dict() for name, camera in self.cameras.items()},
             "config": self.config.model_dump(),
             "axes": self.axes.tolist(),
             "blocks": [block.model_dump() for block in self.blocks],
@@ -156,6 +178,7 @@ class BlockPlan:
         try:
             blocks = _check_blocks(BlockPlanValues.model_validate(values))
             response = Response.from_dict(values["response"])
+            cameras = _cameras_of(values)
         except ValidationError as error:
             raise InputError(path, field_and_problem(error)[1], remedy) from None
         except (SehdrError, ValueError) as error:
@@ -174,6 +197,7 @@ class BlockPlan:
             shared,
             values["exposure_times"],
             values.get("photo_bytes", {}),
+            cameras,
             config_from_dict(values["config"], path),
             np.array(values["axes"], np.float64),
             blocks,
@@ -227,6 +251,7 @@ def make_block_plan(
         shared,
         times,
         _photo_bytes(scene.views),
+        {view.name: view.camera for view in scene.views} if scene.format in FOUND else {},
         config,
         division.axes,
         _blocks(scene, division, points),
@@ -320,6 +345,14 @@ def _blocks(scene: Scene, division: Division, points: np.ndarray) -> tuple[Block
         )
         for index, own in enumerate(division.photos)
     )
+
+
+def _cameras_of(values: Mapping[str, Any]) -> dict[str, Camera]:
+    """Return the cameras in blocks.json by view, none of older plans; raise ValueError for one that is damaged."""
+    try:
+        return {name: Camera.from_dict(camera) for name, camera in values.get("cameras", {}).items()}
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"cameras: one is damaged ({error!r:.200})") from None
 
 
 def _check_blocks(plan: BlockPlanValues) -> tuple[Block, ...]:

@@ -19,11 +19,12 @@ from .block_plan import blocks_for
 def estimate(plan: Plan, requested: Config, device: torch.device, gpus: int = 1) -> tuple[list[Choice], str]:
     """Return ways to train a set with their cost, and which of them is recommended.
 
-    Blocks share the cap_density of the `requested` config, see BlockPlan.config_of(), and not that of the plan. On the
-    CPU, figures for H100 follow those of this machine.
+    Blocks share the mcmc.cap_density of the `requested` config, 120 by default, and one training has that of its plan,
+    240 on a GPU with many photos: see BlockPlan.config_of(). On the CPU, figures for H100 follow those of this machine.
     """
     facts, config = plan.facts, plan.config
-    whole = Workload(facts.photos, facts.pixels / facts.photos, _final_count(facts, config), config.schedule.iterations)
+    pixels, steps = facts.pixels / facts.photos, config.schedule.iterations
+    whole = Workload(facts.photos, pixels, _final_count(facts, config), steps, facts.pixel_bytes)
     divided_config = override_config(config, {"mcmc.cap_density": requested.mcmc.cap_density}, "plan")
     blocks = blocks_for(facts.photos, facts.pixels, divided_config)
     gaussians_needed = divided_config.mcmc.cap_density * math.sqrt(facts.pixels) if blocks > 1 else 0.0
@@ -34,11 +35,13 @@ def estimate(plan: Plan, requested: Config, device: torch.device, gpus: int = 1)
     )
     if device.type == "cuda":
         memory = float(torch.cuda.get_device_properties(device).total_memory)
-        return choices(whole, divided, blocks, memory, gpus), recommend(whole, blocks, memory, gpus)
+        return choices(whole, divided, blocks, memory, gpus), recommend(whole, divided, blocks, memory, gpus)
     threads = thread_count()
     here = Choice(f"CPU, {threads} threads", cpu_cost(whole, threads))
     others = [replace(each, name=f"{each.name} (H100)") for each in choices(whole, divided, blocks, None, gpus)]
-    recommended = recommend(whole, blocks, None) if blocks > 1 else "this machine, or one GPU if that takes too long"
+    recommended = (
+        recommend(whole, divided, blocks, None) if blocks > 1 else "this machine, or one GPU if that takes too long"
+    )
     return [here, *others], recommended
 
 

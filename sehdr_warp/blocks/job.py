@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import SehdrError, as_user_error
-from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.run_folder import RunFolder
 from ..scene import Scene
 from ..subsets import every_nth
@@ -98,13 +97,12 @@ def _train(
 
 def load_block_scene(plan: BlockPlan, index: int, photo_storage: str) -> Scene:
     """Load the photos of a block, with the response and exposure times of the plan, and the points that they show."""
-    names, response = plan.blocks[index].views, response_for_loading(plan.config, plan.response)
-    scene = load_scene_and_log_notes(plan.data | {"views": names}, response=response, photo_storage=photo_storage)
+    names = plan.blocks[index].views
+    scene = plan.load_scene(names, photo_storage)
     if missing := [name for name in names if name not in {view.name for view in scene.views}]:
         raise SehdrError(f"{plan.scene}: {missing[0]} of {plan.blocks[index].name} cannot be read any more")
     options = plan.config.response
     chosen_by = scene.chosen_by if scene.light_known else (options.method, tuple(map(str, options.candidates)))
-    views = tuple(replace(view, exposure_time=plan.exposure_times[view.name]) for view in scene.views)
     most = MOST_POINTS * plan.config.densification.cap_max
     points = every_nth(np.arange(len(scene.points)), most)
     positions = scene.points[points]
@@ -113,6 +111,4 @@ def load_block_scene(plan: BlockPlan, index: int, photo_storage: str) -> Scene:
         counts += weights_of(view.camera, positions) > 0
     inside = plan.division.enlarge(index).contains(positions @ plan.axes.T)
     points = points[(counts >= FEWEST_VIEWS) | (inside & (counts > 0))]
-    return replace(
-        scene, views=views, points=scene.points[points], point_colors=scene.point_colors[points], chosen_by=chosen_by
-    )
+    return replace(scene, points=scene.points[points], point_colors=scene.point_colors[points], chosen_by=chosen_by)

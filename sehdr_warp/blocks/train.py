@@ -3,7 +3,6 @@
 import logging
 import shutil
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,7 +11,6 @@ from ..errors import InputError
 from ..files import make_parents, refuse_links, writing
 from ..runs.config import Config
 from ..runs.config_files import require_same_config
-from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.run import Run, load_run
 from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter
@@ -146,7 +144,5 @@ def _measure(run: Run, plan: BlockPlan, photo_storage: str) -> SeamErrors | None
     names = every_nth(names, MOST_VIEWS)
     if not names:
         return None
-    response = response_for_loading(plan.config, plan.response)
-    scene = load_scene_and_log_notes(plan.data | {"views": names}, response=response, photo_storage=photo_storage)
-    views = tuple(replace(view, exposure_time=plan.exposure_times[view.name]) for view in scene.views)
-    return measure_seams(run, run.normalize_photos(replace(scene, views=views)).views, plan.division)
+    scene = plan.load_scene(names, photo_storage)
+    return measure_seams(run, run.normalize_photos(scene).views, plan.division)

@@ -43,7 +43,7 @@ class Workload:
     pixels: float  # Pixels of a photo
     gaussians: float  # Final number of Gaussians
     iterations: int  # Photos that are trained on
-    code_bytes: int = 3  # Bytes of a photo's pixel
+    pixel_bytes: int = 3  # Bytes of a pixel's codes and, if photos have masks, 4 of its mask
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Cost:
     gpu_bytes: float  # Peak memory of each GPU, without the photos
     network_bytes: float  # Bytes that each node sends and receives
     disk_bytes: float  # Of the run folder
-    photo_bytes: float  # Of the photos in memory, on each node
+    photo_bytes: float  # Of the photos and masks in memory, on each node
     predicted: bool  # Whether it is outside of what was measured
 
 
@@ -98,7 +98,7 @@ def training_cost(work: Workload, gpus: int = 1, nodes: int = 1) -> Cost:
     seconds = steps * (step_seconds(work.pixels, mean) + exchange_seconds(mean, gpus, nodes))
     saves = 1 + min(MOST_SAVES - 1, int(seconds / SAVES_APART))
     around = START_SECONDS + PHOTO_SECONDS * work.photos + saves * SAVE_SECONDS * work.gaussians
-    photos = work.photos * work.pixels * work.code_bytes
+    photos = work.photos * work.pixels * work.pixel_bytes
     return Cost(
         seconds + around,
         FIXED_BYTES + GAUSSIAN_BYTES * work.gaussians + PIXEL_BYTES * work.pixels,
@@ -133,7 +133,7 @@ def block_cost(work: Workload, blocks: int, gpus: int = 1) -> Cost:
 def cpu_cost(work: Workload, threads: int) -> Cost:
     """Return the cost of a training on the CPU."""
     step = (CPU_PIXEL * work.pixels + CPU_GAUSSIAN * work.gaussians / GROWTH) / threads
-    photos = work.photos * work.pixels * work.code_bytes
+    photos = work.photos * work.pixels * work.pixel_bytes
     return Cost(step * work.iterations, 0.0, 0.0, STATE_BYTES * work.gaussians, photos, False)
 
 
@@ -181,7 +181,7 @@ def choices(whole: Workload, divided: Workload, blocks: int, memory: float | Non
     return [Choice(name, cost, memory is None or cost.gpu_bytes <= memory) for name, cost in costs.items()]
 
 
-def recommend(whole: Workload, blocks: int, memory: float | None, gpus: int = 1) -> str:
+def recommend(whole: Workload, divided: Workload, blocks: int, memory: float | None, gpus: int = 1) -> str:
     """Return which way suits a machine with `gpus` GPUs, and why, in one line; arguments as of choices()."""
     several = training_cost(whole, gpus)
     if blocks > 1:
@@ -189,7 +189,7 @@ def recommend(whole: Workload, blocks: int, memory: float | None, gpus: int = 1)
         return f"--blocks {blocks}: the set fills {blocks} trainings of {fill}"
     if memory is not None and several.gpu_bytes > memory:
         needs = f"{format_bytes(several.gpu_bytes)} are more than the {format_bytes(memory)} of a GPU"
-        return f"--blocks {math.ceil(OVERLAP * several.gpu_bytes / memory)}: {needs}"
+        return f"--blocks {max(2, math.ceil(OVERLAP * training_cost(divided).gpu_bytes / memory))}: {needs}"
     alone = training_cost(whole)
     if gpus > 1 and alone.seconds > SAVES * several.seconds:
         return f"--gpus {gpus}: {alone.seconds / several.seconds:.1f} times as fast as one"

@@ -33,7 +33,8 @@ PRUNE_NEAR_ANGLE = 0.12  # mcmc.prune_near_angle if cameras look all around
 CPU_CAP_DENSITY = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
 GPU_CAP_DENSITY = 240.0
 """mcmc.cap_density on a GPU if there are more than MANY_PHOTOS photos of a scene that is not large. With as many,
-held-out photos get sharper and lose nothing; with fewer, Gaussians fit what single photos show, and lose 0.25 dB."""
+held-out photos get sharper and lose nothing; with fewer, Gaussians fit what single photos show, and lose 0.25 dB.
+Blocks keep the requested value: see BlockPlan.config_of()."""
 MANY_PHOTOS = 20
 RATES_FOR = 30_000  # Length of the trainings that 3DGS's learning rates are for
 RATE_POWER, MAX_RATE_SCALE = 0.22, 2.5  # Rates of shorter trainings grow with this power, up to this factor

@@ -15,6 +15,7 @@ from ..scene.images.ldr_files import file_kind
 from ..scene.wide_camera import perspective_views
 from ..subsets import every_nth
 from .initialization import focus_distance, points_on_rays
+from .targets import pixel_bytes
 
 _REMEDY = "take a scene with HDR truth, or a preset that needs none"
 
@@ -53,6 +54,7 @@ class SceneFacts:
     light_known: bool = False  # Whether the photos hold light itself: RAW, linear, float
     unclipped: bool = False  # Whether they are float pictures without clipping
     plateau: int = 0  # Code of 255, below 255, at which the photos clip, as after an edit; 0 if they do not
+    pixel_bytes: int = 3  # Bytes of a pixel of the photos on a device, with its mask
     clipped_when_dark: float = 0.0  # As `clipped`, of the photos with the shortest exposures, three or more
 
     @property
@@ -89,6 +91,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         light_known=scene.light_known,
         unclipped=scene.light_known and all(view.source and file_kind(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
+        pixel_bytes=pixel_bytes(photos),
         clipped_when_dark=float(np.mean([_codes(view)[0] for view in dark_views])),
     )
 

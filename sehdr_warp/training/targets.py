@@ -173,6 +173,12 @@ class ViewStack:
         return TrainingView(camera, time, replace(self.targets, **parts))
 
 
+def pixel_bytes(views: Sequence[View]) -> int:
+    """Return the bytes of a pixel's codes and mask on the device: if one photo has 16 bits or a mask, all get them."""
+    codes = 6 if any(view.codes.dtype == np.uint16 for view in views) else 3
+    return codes + 4 * any(view.mask is not None for view in views)
+
+
 class PhotoSource(Sequence[TrainingView]):
     """Training views whose photos stay in memory or in a file until they are accessed; each access uploads one.
 
@@ -239,7 +245,7 @@ class PhotoSource(Sequence[TrainingView]):
     @property
     def bytes(self) -> int:
         """Memory that all views would take on the device."""
-        parts = (
-            (v.camera.width * v.camera.height, v.mask is not None, self.truth and v.hdr is not None) for v in self.views
-        )
-        return sum(pixels * ((6 if self._deep else 3) + 4 * masked + 12 * true) for pixels, masked, true in parts)
+        truth = (12 * (self.truth and view.hdr is not None) for view in self.views)
+        pixels = (view.camera.width * view.camera.height for view in self.views)
+        each = pixel_bytes(self.views)
+        return sum(count * (each + more) for count, more in zip(pixels, truth, strict=True))

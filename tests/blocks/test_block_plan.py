@@ -11,6 +11,7 @@ from sehdr_warp.blocks.train import train_in_blocks
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import Config
+from sehdr_warp.scene import Camera
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.training.compensation import SharedDecisions
 from tests.make_scenes import edited_json
@@ -29,8 +30,9 @@ def plan(tmp_path):
     ]
     shared, place = SharedDecisions(0.5, None), Normalization(np.zeros(3), 1.0)
     times = {"photo_0": 0.5, "photo_1": 0.25}
-    response = response_by_name("srgb")
-    plan = BlockPlan("town", DATA, response, place, shared, times, {"photo_0": 9}, Config(), np.eye(3), tuple(blocks))
+    response, cameras = response_by_name("srgb"), {"photo_0": Camera(4, 3, 5.0, 5.0, 2.0, 1.5, np.eye(4))}
+    sizes = {"photo_0": 9}
+    plan = BlockPlan("town", DATA, response, place, shared, times, sizes, cameras, Config(), np.eye(3), tuple(blocks))
     plan.write(tmp_path / "run")
     return plan
 
@@ -41,6 +43,7 @@ def test_a_plan_is_read_as_it_was_written(tmp_path, plan):
     assert [(block.name, block.views, block.fraction) for block in read.blocks] == [
         (block.name, block.views, block.fraction) for block in plan.blocks
     ]
+    assert read.cameras["photo_0"].to_dict() == plan.cameras["photo_0"].to_dict()
     assert read.blocks[0].cell.high[0] == 0 and np.isinf(read.blocks[0].cell.low).all()
 
 
@@ -64,7 +67,16 @@ def test_blocks_that_cannot_be(tmp_path, plan, fields, named):
         BlockPlan.read(tmp_path / "run")
 
 
-@pytest.mark.parametrize("fields", [{"axes": [[1.0, 0.0, 0.0]]}, {"blocks": []}, {"base_time": 0}, {"format": 9}])
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"axes": [[1.0, 0.0, 0.0]]},
+        {"blocks": []},
+        {"base_time": 0},
+        {"format": 9},
+        {"cameras": {"photo_0": {"width": 4}}},
+    ],
+)
 def test_plans_that_cannot_be(tmp_path, plan, fields):
     path = tmp_path / "run" / FILE
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))

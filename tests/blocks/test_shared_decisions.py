@@ -1,12 +1,20 @@
 """Decisions that a block takes from the whole set: base time and the compensation of its photos."""
 
+import numpy as np
 import pytest
+import torch
 
+from benchmarks.survey import write_survey
+from sehdr_warp.blocks.block_plan import BlockPlan, make_block_plan
+from sehdr_warp.blocks.job import load_block_scene
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.exposure.compensation import ExposureCompensation
 from sehdr_warp.training.compensation import SharedDecisions
 from sehdr_warp.training.train import create_trainer
 
+from ..found_cameras import TURN, find_cameras, in_other_world, write_bare_photos
 from ..training.toy import EXPOSURE_TIME, VARIANTS, toy_scene
 
 
@@ -24,3 +32,25 @@ def test_a_block_is_trained_with_the_decisions_of_the_set(tmp_path):
 
 def test_without_drift_nothing_is_compensated():
     assert SharedDecisions(1.0, None).compensation_of(toy_scene().views) is None
+
+
+def test_blocks_of_bare_photos_stay_in_the_world_of_the_set(tmp_path, monkeypatch):
+    """A node that finds cameras anew, or a later version, finds another world."""
+    write_survey(tmp_path / "town", views=32, size=48, gaussians=6000)
+    town = load_scene(tmp_path / "town", response="srgb")
+    cameras, points = write_bare_photos(tmp_path / "photos", town.views), town.points
+    find_cameras(monkeypatch, cameras, points=points)
+    config = load_config("demo", {"response.name": "srgb"})
+    data = {"path": str(tmp_path / "photos"), "exposure_index": None, "max_size": None, "holdout": None}
+    plan = make_block_plan(data, config, torch.device("cpu"), 2)
+    assert plan is not None
+    before = [load_block_scene(plan, index, "auto") for index in range(2)]
+    plan.write(tmp_path)
+    others = {name: in_other_world(camera) for name, camera in cameras.items()}
+    find_cameras(monkeypatch, others, points=3 * points @ TURN.T + [1, 2, 3])
+    for index, scene in enumerate(before):
+        after = load_block_scene(BlockPlan.read(tmp_path), index, "auto")
+        assert len(scene.points) > 0
+        np.testing.assert_allclose(after.points, scene.points, atol=1e-9)
+        for view, other in zip(scene.views, after.views, strict=True):
+            np.testing.assert_array_equal(view.camera.world_to_camera, other.camera.world_to_camera)

@@ -15,14 +15,10 @@ from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import CameraEntry, RunFolder
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.dataparser import PointCloud
-from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.normalization import Normalization
-from sehdr_warp.scene.readers import bare_photos
-from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.sfm import reconstruction
-from sehdr_warp.scene.sfm.reconstruction import Reconstruction
 from sehdr_warp.training.train import create_trainer
+from tests.found_cameras import TURN, find_cameras, in_other_world, write_bare_photos
 from tests.refusals import call, refused
 from tests.training.toy import toy_scene
 
@@ -52,22 +48,6 @@ def test_photos_of_a_folder_and_of_a_video_are_loaded_again(monkeypatch, tmp_pat
     assert loaded.views[1].exposure_time == second.exposure_time and loaded.views[1].split == second.split
 
 
-def find_cameras(monkeypatch, cameras, k1=0.02):
-    """Let structure from motion find these cameras, by the photos' stems, with a lens that is not a pinhole."""
-
-    def reconstruct(photos, *_):
-        images = []
-        for index, photo in enumerate(photos):
-            if camera := cameras.get(photo.stem):
-                params = (camera.fx, camera.cx, camera.cy, k1)
-                lens = Lens("SIMPLE_RADIAL", camera.width, camera.height, params, photo)
-                images.append(ModelImage(f"{index:05d}.png", lens, camera.world_to_camera))
-        points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-        return Reconstruction(SparseModel(tuple(images), PointCloud(points, np.ones((50, 3), np.float32))), 0.5, ())
-
-    monkeypatch.setattr(bare_photos, "reconstruct", reconstruct)
-
-
 TRAIN = "--preset demo --max-size 40 --response srgb --device cpu --mcmc.seed-fraction 0 --model.initial-density 0"
 
 
@@ -75,12 +55,10 @@ TRAIN = "--preset demo --max-size 40 --response srgb --device cpu --mcmc.seed-fr
 def bare_run(monkeypatch, tmp_path):
     """Photos without poses, and a run of them that ended after 20 of 40 steps."""
     folder = tmp_path / "photos"
-    folder.mkdir()
     views = load_scene("embedded", max_size=48, response="srgb").views[:10]
-    for view in views:
-        Image.fromarray((view.image * 255).astype(np.uint8)).save(folder / f"{view.name}.png")
+    cameras = write_bare_photos(folder, views)
+    del cameras[views[-1].name]
     shutil.copy(folder / f"{views[0].name}.png", tmp_path / "other.png")
-    cameras = {view.name: view.camera for view in views[:9]}
     find_cameras(monkeypatch, cameras)
     assert call("train", folder, "--out", tmp_path / "run", *TRAIN.split(), "--iterations", 20) == 0
     return folder, tmp_path / "run", cameras
@@ -153,17 +131,6 @@ def without_lenses(run):
         values = json.loads(file.read_text())
         values["run"]["scene.json"] = RunFolder(run).hashes()["scene.json"]
         file.write_text(json.dumps(values))
-
-
-TURN = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
-
-
-def in_other_world(camera):
-    """The camera in a world that is turned, three times as large and moved."""
-    pose = camera.world_to_camera.copy()
-    pose[:3, :3] = pose[:3, :3] @ TURN.T
-    pose[:3, 3] = -pose[:3, :3] @ (3 * TURN @ camera.position + [1, 2, 3])
-    return replace(camera, world_to_camera=pose)
 
 
 def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, monkeypatch, capfd):

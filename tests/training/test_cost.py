@@ -4,8 +4,12 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
+from sehdr_warp.blocks.estimate import estimate
+from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.cost import (
     FIXED_BYTES,
     GAUSSIAN_BYTES,
@@ -19,6 +23,10 @@ from sehdr_warp.training.cost import (
     step_seconds,
     training_cost,
 )
+from sehdr_warp.training.plan import make_plan
+from sehdr_warp.training.targets import PhotoSource
+
+from .toy import toy_scene
 
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "reports" / "results"
 SURVEY = Workload(20_000, 20e6, 76e6, 1_500_000)
@@ -89,12 +97,33 @@ def test_more_gpus_and_blocks_cost_what_they_must():
 
 def test_recommendations():
     small = Workload(400, 4e6, 3e6, 30_000)
-    assert recommend(small, 1, 80e9) == "one GPU: the set is one training"
-    assert recommend(small, 1, 80e9, 2).startswith("--gpus 2: 1.")
-    assert recommend(SURVEY, 65, 80e9, 2).startswith("--blocks 65: the set fills 65 trainings")
-    assert recommend(replace(small, gaussians=2e8), 1, 80e9).startswith("--blocks 4: 225 GB are more than the 80 GB")
-    fits = {choice.name: choice.fits for choice in choices(replace(small, gaussians=2e8), SURVEY, 65, 80e9)}
+    assert recommend(small, small, 1, 80e9) == "one GPU: the set is one training"
+    assert recommend(small, small, 1, 80e9, 2).startswith("--gpus 2: 1.")
+    assert recommend(SURVEY, SURVEY, 65, 80e9, 2).startswith("--blocks 65: the set fills 65 trainings")
+    large, fewer = (replace(small, gaussians=count) for count in (2e8, 1e8))  # Blocks share fewer on a GPU.
+    assert recommend(large, large, 1, 80e9).startswith("--blocks 4: 225 GB are more than the 80 GB")
+    assert recommend(large, fewer, 1, 80e9).startswith("--blocks 2: 225 GB")
+    fits = {choice.name: choice.fits for choice in choices(large, SURVEY, 65, 80e9)}
     assert not fits["1 GPU"] and fits["65 blocks on 1 GPU"]
+
+
+def test_masks_and_wide_codes_count_as_photos():
+    """As they lie on the device: codes of one type, and a mask for each photo if one has a mask."""
+    views = list(toy_scene().views)
+    pixels = sum(view.codes.shape[0] * view.codes.shape[1] for view in views if view.split == "train")
+
+    def estimated(*views):
+        scene = replace(toy_scene(), views=views)
+        device = torch.device("cpu")
+        plan = make_plan(scene, load_config("fast", {"response.name": "srgb"}), device)
+        source = PhotoSource(scene.train_views, 1.0, "cpu", truth=False)
+        assert all(choice.cost.photo_bytes == source.bytes for choice in estimate(plan, plan.config, device)[0])
+        return source.bytes / pixels
+
+    masked = replace(views[0], mask=np.ones(views[0].codes.shape[:2], np.float32))
+    wide = replace(views[1], codes=views[1].codes.astype(np.uint16) * 257)
+    assert [estimated(*views), estimated(masked, *views[1:])] == [3, 7]
+    assert [estimated(views[0], wide, *views[2:]), estimated(masked, wide, *views[2:])] == [6, 10]
 
 
 def test_gpus_that_gain_nothing_are_not_listed_unless_they_are_named():
