@@ -168,6 +168,8 @@ def _match_rigs(database: Path, images: Path, count: int) -> None:
     matching = pycolmap.FeatureMatchingOptions(rig_verification=True, skip_image_pairs_in_same_frame=True)
     options = matching_options()
     with quiet_colmap():
+        with pycolmap.Database.open(database):  # As in reconstruction._extract(): numbers by name
+            pycolmap.import_images(database, images, pycolmap.CameraMode.PER_FOLDER, [], reader)
         arguments = (database, images, [], pycolmap.CameraMode.PER_FOLDER, reader)
         extract = partial(pycolmap.extract_features, *arguments, device=pycolmap.Device.cpu)
         with (

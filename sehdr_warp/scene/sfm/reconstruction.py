@@ -241,21 +241,24 @@ def _device(photo: Path) -> tuple[str, ...]:
 
 
 def _extract(database: Path, work: Path, names: list[str], model: str, params) -> None:
-    """Extract the features of images, in images/ and where masks/ keeps them, that share one camera."""
+    """Extract the features of images, in images/ and where masks/ keeps them, that share one camera.
+
+    All are numbered before, by name. Else threads would number them in the order in which they end, and the world has
+    the axes of the image of a pair that has the lower number.
+    """
     import pycolmap
 
     camera_params = ",".join(f"{value:.17g}" for value in params)
     reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=camera_params)
     if (work / "masks").exists():
         reader.mask_path = work / "masks"
+    with quiet_colmap(), pycolmap.Database.open(database):  # Opening it makes it.
+        pycolmap.import_images(database, work / "images", pycolmap.CameraMode.SINGLE, names, reader)
     for start in range(0, len(names), 8):  # Eight photos at a time, one on each core.
         part = names[start : start + 8]
         with quiet_colmap():
             options = (database, work / "images", part, pycolmap.CameraMode.SINGLE, reader)
             run_interruptibly(partial(pycolmap.extract_features, *options, device=pycolmap.Device.cpu))
-        if start == 0:
-            with pycolmap.Database.open(database) as opened:
-                reader.existing_camera_id = max(image.camera_id for image in opened.read_all_images())
 
 
 def _show_features(progress: Stage, done: int) -> None:

@@ -1,6 +1,8 @@
 """The cache of structure from motion: its key holds whatever changes a result."""
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from sehdr_warp.scene.sfm import pairs, reconstruction
 
@@ -69,3 +71,20 @@ def test_photos_masks_and_another_pycolmap_find_cameras_anew(key, monkeypatch, t
     assert key() != before
     monkeypatch.undo()
     assert reconstruction.cache_key("photos") != reconstruction.cache_key("panoramas")
+
+
+def test_images_are_numbered_by_name_however_long_their_features_take(tmp_path):
+    """The world has the axes of the image with the lower number, so another number is another world."""
+    pycolmap, random = pytest.importorskip("pycolmap"), np.random.default_rng(0)
+    (tmp_path / "images").mkdir()
+    names = [f"{index:05d}.png" for index in range(8)]
+    for index, name in enumerate(names):
+        blocks = random.integers(0, 255, (60, 80), np.uint8)
+        pixels = np.kron(blocks, np.ones((6, 6), np.uint8)) if index == 0 else np.full((360, 480), 99, np.uint8)
+        Image.fromarray(pixels).save(tmp_path / "images" / name)
+    reconstruction._extract(tmp_path / "database.db", tmp_path, names, "SIMPLE_RADIAL", (600.0, 240.0, 180.0, 0.0))
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
+        assert [image.name for image in images] == names
+        assert len({image.camera_id for image in images}) == 1 == opened.num_cameras()
+        assert opened.num_keypoints_for_image(images[0].image_id) > 100
