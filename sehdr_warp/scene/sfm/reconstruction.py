@@ -241,18 +241,15 @@ def _device(photo: Path) -> tuple[str, ...]:
 
 
 def _extract(database: Path, work: Path, names: list[str], model: str, params) -> None:
-    """Extract the features of images, in images/ and where masks/ keeps them, that share one camera.
-
-    All are numbered before, by name. Else threads would number them in the order in which they end, and the world has
-    the axes of the image of a pair that has the lower number.
-    """
+    """Extract the features of images, in images/ and where masks/ keeps them, that share one camera."""
     import pycolmap
 
     camera_params = ",".join(f"{value:.17g}" for value in params)
     reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=camera_params)
     if (work / "masks").exists():
         reader.mask_path = work / "masks"
-    with quiet_colmap(), pycolmap.Database.open(database):  # Opening it makes it.
+    # Threads would number images as they end; the world has the axes of that image of a pair with the lower number.
+    with quiet_colmap(), pycolmap.Database.open(database):
         pycolmap.import_images(database, work / "images", pycolmap.CameraMode.SINGLE, names, reader)
     for start in range(0, len(names), 8):  # Eight photos at a time, one on each core.
         part = names[start : start + 8]
