@@ -80,7 +80,7 @@ def test_inputs_that_are_not_contiguous_give_the_same(options, device):
     colors, _, _ = rasterization(*[*strided, *transposed], WIDTH, HEIGHT, **options)
     assert torch.equal(colors, truth)
     for mine, its in zip(gradients(colors, strided), expected, strict=True):
-        torch.testing.assert_close(mine, its)
+        torch.testing.assert_close(mine, its, rtol=1e-5, atol=1e-4)  # A GPU adds in another order each time.
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
