@@ -1,7 +1,7 @@
 """gsplat's projection: any of its cameras that a matrix describes, and covariances."""
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from .inputs import View, split_views
 from .splats import JoinedSplats
 
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
-CAMERA_MODELS = "pinhole", "ortho", "fisheye"
+CAMERA_MODELS = get_args(CameraModel)
 SMALLEST_SIZE = 1e-30  # A size of 0 has no logarithm; its gradient is 0 as the covariance's is.
 LARGEST_SIZE = 1e12  # Scene units. The squares of larger ones are not finite in an image.
 

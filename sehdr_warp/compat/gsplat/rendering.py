@@ -1,7 +1,7 @@
 """gsplat's rasterization() made of the rasterizer's stages."""
 
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -15,8 +15,8 @@ from .inputs import UNSUPPORTED, check_supported, split_views
 from .projection import CameraModel, ProjectionOptions, project_gaussians
 from .splats import JoinedSplats, make_meta
 
-RENDER_MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RENDER_MODES = get_args(RenderMode)
 RASTERIZE_MODES = "classic", "antialiased"
 DEFAULT_TILE_SIZE = 16
 

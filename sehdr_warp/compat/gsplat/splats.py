@@ -205,7 +205,7 @@ def isect_tiles(
     across = spans[flatten_ids, 0].clamp_min(1)
     tiles = (low[flatten_ids, 1] + places // across) * tile_width + low[flatten_ids, 0] + places % across
     bits = depths.float().view(torch.int32).long() & 0xFFFFFFFF
-    keys = (image_ids[flatten_ids] << _tile_bits(tile_width, tile_height)) | tiles
+    keys = (image_ids[flatten_ids] << (tile_width * tile_height).bit_length()) | tiles
     isect_ids = (keys << 32) | bits[flatten_ids]
     if sort:
         isect_ids, order = isect_ids.sort(stable=True)
@@ -217,10 +217,6 @@ def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_
     """Return [C, tile_height, tile_width] int32: where each tile's intersections begin among sorted isect_ids."""
     tiles = torch.arange(n_images * tile_width * tile_height, device=isect_ids.device)
     image, tile = tiles // (tile_width * tile_height), tiles % (tile_width * tile_height)
-    keys = (image << _tile_bits(tile_width, tile_height)) | tile
+    keys = (image << (tile_width * tile_height).bit_length()) | tile
     offsets = torch.searchsorted((isect_ids >> 32).contiguous(), keys)
     return offsets.int().reshape(n_images, tile_height, tile_width)
-
-
-def _tile_bits(tile_width: int, tile_height: int) -> int:
-    return math.floor(math.log2(tile_width * tile_height)) + 1
