@@ -33,8 +33,8 @@ _log = logging.getLogger(__name__)
 
 MOST_DEPTHS = 100_000  # Largest number of points that the range of depths is estimated from
 MOST_BRIGHTENED_BY = 100  # Photos whose estimates of clipped light are averaged
-FEWEST_POINTS = 20  # With fewer points, random ones are added, at least FEWEST_RANDOM
-FEWEST_RANDOM = 5000
+FEWEST_POINTS = 20  # With fewer points, random ones are added, and depths follow the cameras' focus
+FEWEST_RANDOM = 5000  # Smallest number of random points
 _NO_AGREEMENT = (
     "photos agree on almost no point, as if cameras were wrong or belonged to other photos: compare the order of "
     "photos and poses, or train on the folder of photos alone, whose cameras are then found"
@@ -80,8 +80,8 @@ def make_field(
 ) -> RadianceField:
     """Return the field at iteration 0, in the normalized coordinates of the scene.
 
-    The scene is in its own coordinates, the matcher of its photos in normalized ones. `time` is the exposure time that
-    colors refer to, seconds, by default base_time(). Raises InputError for a scene that cannot be trained.
+    The scene is in its own coordinates, the matcher of its photos in normalized ones. `time` is dt_1, the exposure time
+    that colors refer to, seconds, by default base_time(). Raises InputError for a scene that cannot be trained.
     """
     check_views(scene)
     time = time or base_time(scene)

@@ -26,9 +26,9 @@ from .strategies import mcmc_cap
 STEPS_PER_PHOTO = 75
 """Iterations for each photo. With 300, held-out photos of real captures lose up to 2.6 dB and gain at most 0.3 dB: the
 scene fits what moved between the photos and what their poses do not explain."""
-FEWEST_ITERATIONS = 4000
+FEWEST_ITERATIONS = 4000  # Of a training with few photos, if the config has as many and a CPU has the time
 CPU_SECONDS = 60.0  # Duration of a training on a CPU, if CPU_FEWEST iterations take no longer
-CPU_FEWEST = 1000
+CPU_FEWEST = 1000  # Iterations on a CPU, however long they take
 PRUNE_NEAR_ANGLE = 0.12  # mcmc.prune_near_angle if cameras look all around
 CPU_CAP_DENSITY = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
 GPU_CAP_DENSITY = 240.0
@@ -50,8 +50,8 @@ DROPOUT_STEPS = 250
 MAX_EXPOSURE_RATIO = 2.0**16
 """Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white."""
 COMPENSATION = "exposure-compensation"  # Name of the decision that compensation.py adds
-LEAST_OVERLAP = 0.02
-LEAST_CONTRAST = 1 / 255
+LEAST_OVERLAP = 0.02  # Fraction of places shown by two photos, below which poses or photos are wrong
+LEAST_CONTRAST = 1 / 255  # Standard deviation of all encoded values, below which photos show a single color
 CLIPPED = 0.002
 """Fraction of clipped pixels from which a line says that light above white is an estimate."""
 DRIFT = 3.0  # Stops of brightness between photos that suggest an exposure that changed without being stated

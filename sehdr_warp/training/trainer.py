@@ -117,19 +117,20 @@ class Trainer:
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         check_projections(normalized, config)
         self.can_seed = first_non_pinhole(normalized) is None  # Seeding samples pixels of pinhole photos.
-        make = cache(partial(make_matcher, normalized, field.response, self.device))
-        self._get_matcher: Callable[[], Matcher] | None = get_matcher or make
+        own_matcher = cache(partial(make_matcher, normalized, field.response, self.device))
+        self._get_matcher: Callable[[], Matcher] | None = get_matcher or own_matcher  # None after the last refinement
 
         field.gaussians.release()  # Another trainer of this field may have reserved rows for its own optimizer.
         self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, ranks, self.large_scene)
         use_cuda_graph = config.schedule.use_cuda_graph
         self.graphs = StepGraphs(self.gradient_step, enabled=use_cuda_graph, deterministic=config.deterministic)
         self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
-        self._result: StepResult | None = None
-        self._view_index = 0
+        self._result: StepResult | None = None  # Of the last step
+        self._view_index = 0  # Training view of the last step
         # Why no further step follows: a signal, stop(), another rank that has ended
         self.interrupted, self._stopped, self._ranks_ended = threading.Event(), False, False
-        self._finished, self._seconds_per_iteration = False, 0.0  # The second is a running mean.
+        self._finished = False  # Whether the training came to its end, and its results are written
+        self._seconds_per_iteration = 0.0  # Running mean
         if output is not None:
             output.start(config)
 
