@@ -19,7 +19,7 @@ from .float_photos import with_float_times
 from .masks import assign_masks
 from .photos import usable_photos
 from .preprocess import preprocess
-from .readers.bare_photos import find_photos, place_photos, with_cameras
+from .readers.bare_photos import find_photos, inner_folder, place_photos, with_cameras
 from .readers.colmap import model_fits, read_colmap
 from .readers.colmap_model import find_model, has_images
 from .readers.hdr_sets import is_hdr_gs, read_hdr_gs, read_hdr_nerf, read_hdr_nerf_real
@@ -141,7 +141,7 @@ def parse_dataset(
     cache: Path | str | None = None,
     cameras: Sequence[PlacedPhoto] = (),
 ) -> DataparserOutputs:
-    """Parse cameras, files, exposure times and splits of a data folder; of photos only headers are read.
+    """Parse cameras, files, exposure times and splits of a data folder; of most photos only headers are read.
 
     Everything that can refuse a set is checked before structure from motion, which takes minutes; so is a response that
     does not apply. Arguments and errors are those of load_scene().
@@ -151,7 +151,7 @@ def parse_dataset(
     folder = _folder(path)
     dataset = read_video(folder, cache) if is_video(folder) else _read(folder)
     name = str(path) if is_embedded(path) else folder.resolve().name
-    folder = folder if folder.is_dir() else dataset.folder
+    folder = folder if dataset.folder == Path() else dataset.folder
     if not dataset.records:
         raise InputError(folder, "has no views", "check the data folder")
     records, mask_notes = assign_masks(dataset.records, folder)
@@ -171,6 +171,11 @@ def parse_dataset(
             untimed = [replace(record, exposure_time=None, time_known=True) for record in records]
             records, times_known, time_notes = with_times(untimed, folder)
             dataset = replace(dataset, times_known=times_known)
+    pose_notes: list[str] = []
+    if dataset.format == "transforms" and not len(dataset.cloud.positions):  # Points would show wrong poses.
+        from .pose_conventions import with_fitting_poses
+
+        records, pose_notes = with_fitting_poses(records)
     records, camera_notes = check_cameras(records, dataset.cloud)
     records, split_notes = _with_splits(records, dataset, holdout)
     training = sum(record.split == "train" for record in records)
@@ -178,7 +183,7 @@ def parse_dataset(
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
     notes = (*dataset.notes, *mask_notes, *truth_notes, *exposure_notes, *photo_notes, *time_notes)
-    notes = (*notes, *camera_notes, *split_notes)
+    notes = (*notes, *pose_notes, *camera_notes, *split_notes)
     if not is_embedded(path) and dataset.format != "video":
         notes = (*notes, *unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]))
     return replace(dataset, records=tuple(records), notes=notes, name=name, unplaced=len(unplaced))
@@ -231,7 +236,12 @@ def _read(folder: Path) -> DataparserOutputs:
         (has("poses_bounds.npy"), read_llff),
         (model != posed, partial(read_colmap, source=model)),  # Refused: nothing else has poses.
     )
-    dataset = next((reader for fits, reader in readers if fits), find_photos)(folder)
+    reader = next((reader for fits, reader in readers if fits), None)
+    if reader is None and model is None and (inner := inner_folder(folder)) is not None:
+        note = f"photos are read from {inner.relative_to(folder)}, the only folder with photos"
+        dataset = _read(inner)
+        return replace(dataset, folder=inner, notes=(note, *dataset.notes))
+    dataset = (reader or find_photos)(folder)
     if model is not None and posed is None:
         note = f"{model.relative_to(folder)} has no images.bin or images.txt: its cameras are not used"
         dataset = replace(dataset, notes=(*dataset.notes, note))

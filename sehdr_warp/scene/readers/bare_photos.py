@@ -32,7 +32,8 @@ from .transforms import is_transforms
 
 _log = logging.getLogger("sehdr_warp.scene")
 
-_DEEPEST = 3  # Levels of folders in which photos are looked for, to name their folder
+_DEEPEST = 3  # Levels of folders in which photos are looked for
+_NO_PHOTOS = (*OTHER_FOLDERS, "depth", "depths", "confidence", "normals", "thumbnails")  # Folders of other pictures
 # Files and folders by which a program states cameras, in lower case.
 _POSE_FILES = {
     "cameras.xml": "Metashape", "bundle.out": "Bundler", "bundle.rd.out": "Bundler", "sfm_data.json": "OpenMVG",
@@ -79,13 +80,22 @@ def find_photos(folder: Path) -> DataparserOutputs:
     for place in ("sparse/0", "sparse"):
         if not model and any((folder / place / f"images{end}").is_file() for end in (".bin", ".txt")):
             notes.append(f"{place} is not read, because it has no cameras.bin or cameras.txt: cameras are found anew")
-    if photos[0].parent == folder and (
-        inner := [name for name in _folders_with_photos(folder) if name not in OTHER_FOLDERS]
-    ):
+    if photos[0].parent == folder and (inner := _folders_with_photos(folder)):
         notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
     records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)
     names = tuple(photo.name for photo in copies)
     return DataparserOutputs("photos", tuple(records), notes=tuple(notes), mentioned=names)
+
+
+def inner_folder(folder: Path) -> Path | None:
+    """Return the only folder below that holds photos or a set; None if several do, or this one has media or poses.
+
+    Archives and exports have their photos in folders of folders; a single picture beside them is a cover.
+    """
+    if len(list_images(folder, PHOTO_SUFFIXES)) > 1 or unread_kinds(folder) or _foreign_poses(folder):
+        return None
+    inner = _folders_with_photos(folder)
+    return folder / inner[0] if len(inner) == 1 and inner[0] not in ("images", INPUT) else None
 
 
 def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[DataparserOutputs, list[str]]:
@@ -227,15 +237,16 @@ def _remedy_without_photos(folder: Path) -> str:
 
 
 def _folders_with_photos(folder: Path) -> list[str]:
-    """List folders with photos below a folder, at most _DEEPEST levels down, as paths relative to it.
+    """List folders with photos below a folder, at most _DEEPEST levels down, as paths relative to it; runs are no such.
 
     Of a set with cameras it is the folder of the set.
     """
     result: dict[str, None] = {}
-    for root, folders, _ in os.walk(folder):
+    for root, folders, files in os.walk(folder):
         place = Path(root).relative_to(folder)
         deepest = len(place.parts) >= _DEEPEST
-        folders[:] = [] if deepest else sorted(name for name in folders if not is_system_file(name))
+        others = (name for name in folders if is_system_file(name) or name.lower() in _NO_PHOTOS)
+        folders[:] = [] if deepest or "run.json" in files else sorted({*folders} - {*others})
         if place.parts and list_images(folder / place, PHOTO_SUFFIXES):
             above = folder / place.parent
             has_cameras = any((above / name).is_file() for name in _CAMERA_FILES) or find_model(above) is not None

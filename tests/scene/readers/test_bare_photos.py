@@ -56,15 +56,21 @@ def test_an_archive_is_to_be_unpacked(tmp_path):
         parse_dataset(tmp_path / "scan.zip")
 
 
-def test_photos_deep_in_an_export_are_found_for_the_user(tmp_path):
-    """Polycam's raw export: a thumbnail beside keyframes; and a COLMAP set two folders down."""
-    photos(tmp_path / "poly" / "keyframes" / "corrected_images")
-    Image.fromarray(pattern(16, 12)).save(tmp_path / "poly" / "thumbnail.jpg")
-    files(tmp_path / "poly", "mesh_info.json")
+def test_photos_deep_in_an_export_are_read(tmp_path):
+    """A COLMAP set two folders down; Polycam's raw export, a thumbnail beside keyframes, has poses to decide about."""
+    poly = tmp_path / "poly"
+    photos(poly / "keyframes" / "corrected_images")
+    photos(poly / "keyframes" / "depth")
+    Image.fromarray(pattern(16, 12)).save(poly / "thumbnail.jpg")
+    files(poly, "mesh_info.json")
     remedy = "give .* with photos: keyframes/corrected_images; poses of Polycam"
     with pytest.raises(InputError, match=f"is the only photo there; {remedy}"):
-        parse_dataset(tmp_path / "poly")
+        parse_dataset(poly)
     write_colmap(tmp_path / "work" / "dense" / "1")
+    dataset = parse_dataset(tmp_path / "work")
+    assert dataset.format == "colmap" and dataset.name == "work"
+    assert "photos are read from dense/1, the only folder with photos" in dataset.notes
+    (tmp_path / "work" / "clip.mp4").touch()  # Perhaps the photos' source, perhaps what was meant.
     with pytest.raises(InputError, match="give one of its folders with photos: dense/1$"):
         parse_dataset(tmp_path / "work")
 

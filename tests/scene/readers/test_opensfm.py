@@ -80,8 +80,7 @@ def test_projects_of_opendronemap(tmp_path, images):
         (tmp_path / "images").rename(tmp_path / images)
     (tmp_path / images / "1.jpg").rename(tmp_path / images / "1.JPG")
     assert len(load_scene(tmp_path, response="srgb").views) == 4
-    with pytest.raises(InputError, match="give one of its folders with photos: set"):
-        load_scene(write(tmp_path / "above" / "set").parent, response="srgb")
+    assert load_scene(write(tmp_path / "above" / "set").parent, response="srgb").format == "opensfm"
 
 
 def test_colmap_panoramas(tmp_path):
