@@ -25,7 +25,7 @@ _READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 """World-to-camera matrices, by what the file holds, of one that was read as camera-to-world in OpenGL's axes."""
 _SIDE = 800  # Pixels of the longest side that are compared
-_MOST_PAIRS, _FEWEST_PAIRS, _SURE_PAIRS = 8, 4, 3  # That are compared, that convict poses, and that acquit them
+_MOST_PAIRS, _FEWEST_PAIRS, _SURE_PAIRS = 8, 4, 3  # That are compared, that show poses to be wrong, and right
 _FEWEST_MATCHES, _RATIO = 30, 0.75  # Of a pair; a match's distance as part of that of the second best
 _FITS, _MISSES = 1.5, 6.0  # Pixels: sound poses have 0.1 to 0.6, other axes 3 to 130
 _LEAST_SHARE = 0.75  # Of the pairs, which another reading must fit
@@ -71,8 +71,8 @@ def with_fitting_poses(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord
         remedy = "to find the cameras anew, give a folder with the photos alone"
         return list(records), [f"poses: they do not fit the photos, by no convention: {miss}; {remedy}"]
     fitting = [replace(record, world_to_camera=_READINGS[best](record.world_to_camera)) for record in records]
-    fit = f"they fit the photos ({np.median(others[best]):.1f} pixels)"
-    return fitting, [f"poses: {miss} by the convention of transforms.json; read {best}, which is done, {fit}"]
+    fit = f"which fits the photos ({np.median(others[best]):.1f} pixels)"
+    return fitting, [f"poses: {miss} by the convention of transforms.json; they are read {best} instead, {fit}"]
 
 
 def _features(

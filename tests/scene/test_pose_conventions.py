@@ -35,9 +35,9 @@ def write(folder, views, matrix_of):
     ("matrix_of", "words"),
     [
         (lambda pose: np.linalg.inv(pose) @ FLIP, None),
-        (np.linalg.inv, "read as camera-to-world in OpenCV's axes, which is done"),
-        (lambda pose: pose, "read as world-to-camera in OpenCV's axes, which is done"),
-        (lambda pose: FLIP @ pose, "read as world-to-camera in OpenGL's axes, which is done"),
+        (np.linalg.inv, "read as camera-to-world in OpenCV's axes instead"),
+        (lambda pose: pose, "read as world-to-camera in OpenCV's axes instead"),
+        (lambda pose: FLIP @ pose, "read as world-to-camera in OpenGL's axes instead"),
     ],
 )
 def test_poses_are_read_as_they_fit_the_photos(tmp_path, views, matrix_of, words):

@@ -1,9 +1,12 @@
 """Beside gsplat itself, where it is installed: its torch functions on the CPU, and its kernels on a GPU."""
 
 import math
+import tempfile
+from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
 
 from sehdr_warp.compat import gsplat as ours
 
@@ -11,6 +14,13 @@ from .scenes import COUNT, HEIGHT, WIDTH, gradients, scene
 
 gsplat = pytest.importorskip("gsplat")
 reference = pytest.importorskip("gsplat.cuda._torch_impl")
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """gsplat's kernels, which two processes cannot compile at one time: each removes what the other has begun."""
+    with FileLock(Path(tempfile.gettempdir(), "gsplat-compiles.lock")):
+        pytest.importorskip("gsplat.cuda._backend")
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
@@ -96,6 +106,7 @@ def test_its_own_strategy_takes_what_we_render_and_does_what_ours_does(absgrad):
 @pytest.mark.parametrize(
     "options", [{}, {"render_mode": "RGB+ED"}, {"sh_degree": 2}, {"rasterize_mode": "antialiased"}]
 )
+@pytest.mark.usefixtures("compiled")
 def test_images_and_gradients_are_gsplats(options, packed):
     leaves, place = scene("cuda:0", coefficients=9 if "sh_degree" in options else 0)
     results = []
