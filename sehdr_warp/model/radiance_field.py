@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_harmonics
+from ..rasterizer.checks import opacities_above_1
 from ..rasterizer.cuda_graphs.runner import without_replays
 from ..response import Response
 from ..scene import Camera
@@ -91,6 +92,7 @@ class RadianceField(nn.Module):
         require_camera(camera)
         return CameraTensors.of(self.normalization.camera(camera), self.gaussians.means.device)
 
+    @opacities_above_1()  # With factors
     def render_train_view(
         self,
         camera: CameraTensors,

@@ -142,7 +142,10 @@ def in_world_of_run(
 
     views = [view for view in scene.views if view.name in cameras]
     pairs = [(view.camera, cameras[view.name]) for view in views]
-    if all(np.array_equal(new.world_to_camera, old.world_to_camera) for new, old in pairs):
+    zooms = np.array([new.fx / new.width * old.width / old.fx for new, old in pairs])
+    unlike = np.abs(zooms - 1) > _MOST_ZOOMED
+    is_same_world = all(np.array_equal(new.world_to_camera, old.world_to_camera) for new, old in pairs)
+    if is_same_world and not unlike.any():
         return scene
     turns = np.stack([old.world_to_camera[:3, :3].T @ new.world_to_camera[:3, :3] for new, old in pairs])
     u, _, vt = np.linalg.svd(turns.sum(0))
@@ -153,8 +156,7 @@ def in_world_of_run(
     scale = np.linalg.norm(known - known.mean(0)) / spread if spread else 1.0
     shift = known.mean(0) - scale * found.mean(0)
     distances = np.linalg.norm(scale * found + shift - known, axis=1) / unit
-    zooms = np.array([new.fx / new.width * old.width / old.fx for new, old in pairs])
-    unlike = (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED) | (np.abs(zooms - 1) > _MOST_ZOOMED)
+    unlike |= (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED)
     if unlike.any():
         problem = f"{unlike.sum()} of {len(views)} photos have other cameras than {run} was trained with"
         remedy = "put photos and cameras back as they were then, or train again"

@@ -32,5 +32,5 @@ class Dropout:
         if self.factors is None or len(self.factors) != rows:
             self.factors = torch.empty(rows, device=self._generator.device)
         left = 1 - self._share * iteration / self._total
-        self._generator.manual_seed(self._random_seed * SEED_STRIDE + iteration)
+        self._generator.manual_seed((self._random_seed * SEED_STRIDE + iteration) % 2**63)
         self.factors.bernoulli_(left, generator=self._generator).div_(left)

@@ -193,7 +193,11 @@ def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_th
     moved[:3, 3] += 0.5
     turned[:3, :3] = turned[:3, :3] @ TURN
     turned[:3, 3] = -turned[:3, :3] @ first.position
-    changes = [{"world_to_camera": moved}, {"world_to_camera": turned}, {"fx": 1.01 * first.fx, "fy": 1.01 * first.fy}]
+    zoom = {"fx": 1.01 * first.fx, "fy": 1.01 * first.fy}
+    zoomed = replace(scene.views[0], camera=replace(scene.views[0].camera, **zoom))  # In the world of the run
+    with pytest.raises(InputError, match="1 of 5 photos have other cameras than run was trained with: v_0"):
+        opening.in_world_of_run(replace(scene, views=(zoomed, *scene.views[1:])), cameras, 4.0, "run", "photos")
+    changes = [{"world_to_camera": moved}, {"world_to_camera": turned}, zoom]
     for change in changes:
         changed = replace(views[0], camera=replace(first, **change))
         with pytest.raises(InputError, match="of 5 photos have other cameras than run was trained with: v_0"):

@@ -6,7 +6,7 @@ import torch
 from sehdr_warp.model.gaussians import moments_of
 from sehdr_warp.training.dropout import Dropout
 
-from .toy import VARIANTS, make_trainer
+from .toy import VARIANTS, make_trainer, quick
 
 ROWS = 100_000
 
@@ -52,3 +52,15 @@ def test_gaussians_that_are_left_out_get_no_gradient(scene):
         squares = moments_of(trainer.optimizer, trainer.field.gaussians.log_scales)["exp_avg_sq"]
         shares.append(float(squares.any(1).float().mean()))
     assert shares[1] == pytest.approx(0.5 * shares[0], abs=0.1)
+
+
+def test_gaussians_that_are_nearly_opaque_are_left_out_too(scene):
+    """Divided by what is left, their opacities are above 1."""
+    config = quick(**{"model.dropout": 0.5, "seed": 2**62})
+    trainer = make_trainer(scene, config)
+    trainer.field.gaussians.opacity_logits.data.fill_(6.0)
+    trainer.iteration = trainer.total - 1
+    trainer.step()
+    assert trainer.loss < 1
+    squares = moments_of(trainer.optimizer, trainer.field.gaussians.harmonics_dc)["exp_avg_sq"]
+    assert 0 < float(squares.any(1).float().mean()) < 0.6
