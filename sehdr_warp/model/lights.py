@@ -123,7 +123,9 @@ def find_lights(
     white = _reference_white(np.minimum(whites, most), peak, pixels)  # pyright: ignore[reportArgumentType]
     # Photos of half the exposure or less measure lights and do not clip them, so these do not count.
     usual = [(part[0], each) for part, each in zip(sums, whites, strict=True) if each < 2 * white]
-    too_bright = torch.stack([seen * (peak > BRIGHT * each) for seen, each in usual]).sum(0)
+    too_bright = torch.zeros_like(peak)
+    for seen, each in usual:
+        too_bright += seen * (peak > BRIGHT * each)
     # The share is lower if the scene contradicts the other photos, which then weigh more.
     weighted = too_bright + RESIDUAL_WEIGHT * (pixels - too_bright)
     clips = clipped.to(mean.device) >= CLIPPED * too_bright / weighted.clamp_min(1e-20)
@@ -136,6 +138,7 @@ def find_lights(
     positions = field.normalization.scene_points(gaussians.means[members].cpu().numpy())
     widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
     weights = (pixels * mean.mean(1))[members].cpu().numpy()
+    certain = (too_bright > 0)[members].cpu().numpy()
     brightness = peak[members].cpu().numpy()
     uncertainty = None if field.clipped_stops is None else field.clipped_stops.to(members.device)[members].cpu().numpy()
     confidence = torch.ones_like(peak) if field.confidence is None else field.confidence.to(peak.device)
@@ -145,6 +148,8 @@ def find_lights(
     total = max(float(_view_sums(field, _panorama(middle, focal), degree)[2].mean(1).sum()), 1e-30)
     lights = []
     for group in _groups(positions, REACH * float(np.median(widths))):
+        if weights[group] @ certain[group] < CLIPPED * weights[group].sum():
+            continue  # Darker photos alone show most of it and do not clip it, as the part of a walk in the sun.
         shape = _shape(positions[group], widths[group], weights[group], middle)
         whole = [_in_frame(camera, positions[group], widths[group], weights[group]) for camera in cameras]
         angles_of_shape = np.array([shape.solid_angle(camera.position) for camera in cameras])

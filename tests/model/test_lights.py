@@ -215,3 +215,15 @@ def test_errors_of_unclipped_values_count_if_these_measure_a_light():
         clipped = photograph(scene, shots, photos)
         (light,) = find_lights(scene, clipped, shots)
         assert light.deviation == pytest.approx(deviation, abs=0.05)
+
+
+def test_bright_places_that_darker_photos_alone_show_are_no_lights():
+    """As of a walk from a room into the sun, where the camera shortens its exposure."""
+    scene = field(np.concatenate([panel(6, 4, 0.12), panel(6, 4, 0.12, at=(0, 0, -4.0))]), (0.3, 0.3, 0.3), 0.08)
+    outside = scene.gaussians.means[:, 2] < 0
+    scene.gaussians.harmonics_dc.data[outside] *= 64
+    inside_views = [(camera, 1.0) for camera, _ in small_views(((0, 0, 4.0),))]
+    outside_views = [(camera, 1 / 64) for camera, _ in small_views(((0, 0, -4.0),))]
+    shots = inside_views + outside_views
+    clipped = photograph(scene, shots)
+    assert not clipped.any() and find_lights(scene, clipped, shots) == []
