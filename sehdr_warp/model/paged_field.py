@@ -44,6 +44,7 @@ class PagedField(RadianceField):
             **_options(field),
         )
         self.confidence, self.clipped_stops = field.confidence, field.clipped_stops
+        self.photo_filters = field.photo_filters
         self._device, self.budget = device, budget
         means = field.gaussians.means.detach()
         reach = DEVIATIONS * field.gaussians.log_scales.detach().amax(1, keepdim=True).exp()

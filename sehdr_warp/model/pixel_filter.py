@@ -16,10 +16,12 @@ from torch.nn import functional
 
 from ..rasterizer.render_options import EPS2D
 from ..scene import Camera
+from ..subsets import every_nth
 from .renders import CameraTensors
 
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
 TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
+MOST_CAMERAS = 128  # Each takes a few tenths of a second of a million Gaussians.
 NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
 
 
@@ -53,24 +55,29 @@ def photo_filters(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """Return the standard deviations [N] of the photos' filter where Gaussians are, in scene units.
 
     It is the geometric mean of those of the cameras that have the place in their picture, or that of the nearest camera
-    if none has. A round Gaussian as large as a camera's filter covers the area of that filter.
+    if none has; of more than MOST_CAMERAS, a part is asked. A round Gaussian as large as a camera's filter covers the
+    area of that filter.
 
     Args:
         means: [N, 3] scene coordinates.
         cameras: Training cameras, one or more.
     """
-    count, logarithms, nearest = np.zeros(len(means)), np.zeros(len(means)), np.full(len(means), np.inf)
-    for camera in cameras:
-        distance = np.maximum(np.linalg.norm(means - camera.position, axis=1), NEAR)
-        pixel, inside = distance / math.sqrt(camera.fx * camera.fy), np.ones(len(means), bool)
-        nearest = np.minimum(nearest, pixel)
+    from scipy.spatial import KDTree
+
+    angles = np.array([1 / math.sqrt(camera.fx * camera.fy) for camera in cameras])
+    nearest, index = KDTree(np.stack([camera.position for camera in cameras])).query(means)
+    count, logarithms = np.zeros(len(means)), np.zeros(len(means))
+    for camera, angle in zip(every_nth(cameras, MOST_CAMERAS), every_nth(angles, MOST_CAMERAS), strict=True):
+        rows, tilts = slice(None), 0.0
         if camera.is_pinhole:
             projected = camera.project(means)
-            # A pixel covers depth^3 / (distance fx fy) of a sphere about the camera at this distance.
-            inside, pixel = projected.inside, pixel * np.nan_to_num(projected.depth / distance, nan=1.0) ** 1.5
-        count += inside
-        logarithms += np.where(inside, np.log(pixel), 0)
-    pixels = np.where(count > 0, np.exp(logarithms / np.maximum(count, 1)), nearest)
+            rows = np.flatnonzero(projected.inside)
+            tilts = np.log(projected.depth[rows])
+        distances = np.log(np.maximum(np.linalg.norm(means[rows] - camera.position, axis=1), NEAR))
+        # A pixel covers depth^3 / (distance fx fy) of a sphere about the camera at this distance.
+        logarithms[rows] += math.log(angle) + (1.5 * tilts - 0.5 * distances if camera.is_pinhole else distances)
+        count[rows] += 1
+    pixels = np.where(count > 0, np.exp(logarithms / np.maximum(count, 1)), np.maximum(nearest, NEAR) * angles[index])
     return (math.sqrt(EPS2D) * pixels).astype(np.float32)
 
 

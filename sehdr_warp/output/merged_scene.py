@@ -93,8 +93,9 @@ def _joined_gaussians(scenes: Sequence[RenderableScene], moves: Sequence[WorldTr
         parts = [part.with_filter() for part in parts]
         for scene, part in zip(scenes, parts, strict=True):
             if not part.antialiased:
-                problem = "was trained without opacity compensation (model.antialiased), unlike another scene to merge"
-                raise SehdrError(f"{scene.path}: {problem}; train all of them alike")
+                problem = "is rendered without opacity compensation, unlike another scene to merge"
+                remedy = "merge the run of that scene, or a .ply, .glb or USD file of it, in place of a smaller file"
+                raise SehdrError(f"{scene.path}: {problem}; {remedy}")
     return join_gaussians(parts)
 
 

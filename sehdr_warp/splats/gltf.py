@@ -62,6 +62,8 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
     extras: dict[str, Any] = {"base_exposure_time": gaussians.base_time}
     if gaussians.photo_focals is not None:
         extras["photo_focals"] = list(gaussians.photo_focals)
+    if gaussians.antialiased:
+        extras["opacity_compensation"] = True
     if gaussians.world_matrix is not None:
         extras["world_matrix"] = gaussians.world_matrix.tolist()
     described = {
@@ -141,6 +143,7 @@ def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path
         color_model="display",
         base_time=float(extras.get("base_exposure_time", 1.0)),
         world_matrix=read_matrix(extras.get("world_matrix"), path),
+        antialiased=extras.get("opacity_compensation") is True,
         photo_focals=read_focals(extras.get("photo_focals"), path),
     )
     return gaussians.without_filter(values(_FILTER, 1)[:, 0]) if _FILTER in attributes else gaussians

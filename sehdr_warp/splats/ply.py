@@ -127,7 +127,7 @@ def read_ply(path: Path) -> GaussianArrays:
     arrays = means, log_scales, quaternions, opacity[:, 0], harmonics
     facts = _facts(read.comments, path)
     gaussians = GaussianArrays(*arrays, **facts._asdict())
-    if facts.antialiased and facts.photo_focals is not None and "nx" in names:
+    if facts.antialiased and facts.photo_focals is not None and "nx" in names and vertex["nx"].any():
         return gaussians.without_filter(np.asarray(vertex["nx"], np.float32))
     log_compensation(path, facts.antialiased, MIP)
     return gaussians

@@ -19,6 +19,7 @@ from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_focals, read_mat
 COLOR_SPACE = "lin_rec709_scene"
 _BASE_TIME, _WORLD_MATRIX = "sehdr:baseExposureTime", "sehdr:worldMatrix"
 _FILTER, _FOCALS = "sehdr:filter", "sehdr:photoFocals"  # filter_shares and photo_focals of GaussianArrays
+_COMPENSATED = "sehdr:opacityCompensation"
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _BIAS = 0.5 / HARMONIC_0
 _FAINTEST = 1 / 255  # Opacity below which programs draw nothing of a Gaussian
@@ -85,6 +86,8 @@ def _write_stage(path: Path, gaussians: GaussianArrays) -> None:
         prim.CreateAttribute(_WORLD_MATRIX, Sdf.ValueTypeNames.Matrix4d, True).Set(matrix)
     if gaussians.photo_focals is not None:
         prim.CreateAttribute(_FOCALS, Sdf.ValueTypeNames.DoubleArray, True).Set(list(gaussians.photo_focals))
+    if gaussians.antialiased:
+        prim.CreateAttribute(_COMPENSATED, Sdf.ValueTypeNames.Bool, True).Set(True)
     if (shares := gaussians.filter_shares) is not None:
         prim.CreateAttribute(_FILTER, Sdf.ValueTypeNames.FloatArray, True).Set(_array("FloatArray", shares))
     harmonics = gaussians.harmonics.astype(np.float32, copy=True)
@@ -138,9 +141,14 @@ def read_usd(path: Path) -> GaussianArrays:
         color_model="linear",
         base_time=float(arrays["base_time"]),
         world_matrix=None if np.array_equal(matrix, np.eye(4)) else matrix,  # pyright: ignore[reportArgumentType]
+        antialiased=bool(arrays["compensated"]),
         photo_focals=read_focals(arrays.get("focals"), path),
     )
-    return gaussians.without_filter(values(_FILTER, 1)[:, 0]) if _FILTER in arrays else gaussians
+    if _FILTER not in arrays:
+        return gaussians
+    if len(shares := values(_FILTER, 1)[:, 0]) != len(scales):
+        raise InputError(path, f"its {_FILTER} has {len(shares)} values, not {len(scales)}", "export it again")
+    return gaussians.without_filter(shares)
 
 
 def usd_arrays(path: Path) -> dict[str, Any]:
@@ -160,6 +168,7 @@ def usd_arrays(path: Path) -> dict[str, Any]:
         "world_matrix": np.array(world.Get()).T if (world := prim.GetAttribute(_WORLD_MATRIX)) else np.eye(4),
         "base_time": float(prim.GetAttribute(_BASE_TIME).Get()) if prim.HasAttribute(_BASE_TIME) else 1.0,
     }
+    arrays["compensated"] = prim.HasAttribute(_COMPENSATED) and bool(prim.GetAttribute(_COMPENSATED).Get())
     if prim.HasAttribute(_FOCALS):
         arrays["focals"] = np.array(prim.GetAttribute(_FOCALS).Get(), np.float64)
     for name in ("positions", "scales", "orientations", "opacities", _HARMONICS, _FILTER):

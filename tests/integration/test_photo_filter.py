@@ -19,6 +19,7 @@ from ..splats.test_splat_files import LOSSY_SUFFIXES
 
 VIEW = camera(96, 72)
 LOSSLESS_SUFFIXES = (".ply", ".glb", ".usdc")
+COLORS = {".usdc": "linear"}
 
 
 @pytest.fixture
@@ -103,3 +104,24 @@ def test_files_without_known_photos_are_written_as_they_are(tmp_path, run):
     converted = read_gaussians(export(load_splats(tmp_path / "a.ply"), tmp_path / "b.glb", axes=None))
     assert converted.filters is None and not converted.antialiased
     np.testing.assert_allclose(np.exp(converted.log_scales), 0.012, rtol=1e-4)
+
+
+@pytest.mark.parametrize("suffix", LOSSLESS_SUFFIXES)
+def test_a_small_file_keeps_its_mark_in_a_large_one(tmp_path, run, suffix):
+    """Else lamps, whose sizes include the filter, would be shown with up to twice their light."""
+    small = read_gaussians(export(run, tmp_path / "a.compressed.ply", axes="scene"))
+    write_gaussians(tmp_path / f"b{suffix}", small.with_colors(small.harmonics, COLORS.get(suffix, "display")))
+    large = read_gaussians(tmp_path / f"b{suffix}")
+    assert large.antialiased and large.filters is None
+    np.testing.assert_allclose(large.log_scales, small.log_scales, atol=1e-5)
+
+
+def test_filters_of_other_gaussians_are_refused(tmp_path, run):
+    """As a program leaves them that removes Gaussians from a stage and does not know of the filter."""
+    Usd = pytest.importorskip("pxr.Usd")
+    file = export(run, tmp_path / "a.usda", axes="scene")
+    stage = Usd.Stage.Open(str(file))
+    stage.GetDefaultPrim().GetAttribute("sehdr:filter").Set([0.5, 0.5])
+    stage.Save()
+    with pytest.raises(InputError, match="its sehdr:filter has 2 values, not 60"):
+        read_gaussians(file)

@@ -44,6 +44,11 @@ def camera(x: float, ahead: float = 0.1, height: float = 1.5) -> Camera:
     return Camera(48, 32, 40.0, 40.0, 24.0, 16.0, pose)
 
 
+def test_the_filter_of_a_file_stays_known(street):
+    street.photo_filters = np.linspace(0.01, 0.02, 4000, dtype=np.float32)
+    assert PagedField(street, CPU, budget=10**9).photo_filters is street.photo_filters
+
+
 def test_pictures_are_those_of_the_whole(street):
     paged = PagedField(street, CPU, budget=10**9)
     for place in (camera(3), camera(30), camera(20, ahead=8)):

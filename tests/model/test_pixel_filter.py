@@ -87,6 +87,7 @@ def test_the_filter_of_photos_is_the_mean_of_cameras_that_show_a_place_or_of_the
     aside = replace(near, cx=500.0)
     np.testing.assert_allclose(photo_filters(middle, [far, aside]), 8 * pixel, rtol=1e-6)
     np.testing.assert_allclose(photo_filters(behind, [far, near]), pixel, rtol=1e-6)
+    np.testing.assert_allclose(photo_filters(behind, [*[near] * 400, far]), pixel, rtol=1e-6, err_msg="of all cameras")
     np.testing.assert_allclose(photo_filters(middle, [replace(FISHEYE, world_to_camera=pose_at(3.0))]), 3 * pixel)
 
 

@@ -100,7 +100,7 @@ def test_normalized_fields_meet_in_scene_coordinates(tmp_path, run):
 def test_scenes_with_and_without_compensation_are_refused(tmp_path, run):
     other = other_of(tmp_path)
     other.field.antialiased = True
-    with pytest.raises(SehdrError, match=r"s\.ply: was trained without opacity compensation"):
+    with pytest.raises(SehdrError, match=r"s\.ply: is rendered without opacity compensation"):
         merge_scenes(other, run)
 
 
