@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_harmonics
-from ..rasterizer.checks import opacities_above_1
 from ..rasterizer.cuda_graphs.runner import without_replays
 from ..response import Response
 from ..scene import Camera
@@ -92,7 +91,6 @@ class RadianceField(nn.Module):
         require_camera(camera)
         return CameraTensors.of(self.normalization.camera(camera), self.gaussians.means.device)
 
-    @opacities_above_1()  # With factors
     def render_train_view(
         self,
         camera: CameraTensors,
@@ -114,12 +112,12 @@ class RadianceField(nn.Module):
             extra_images: Further images to render: any of "exposure" and "base".
             max_intersections: As in rasterize().
             encode: If False, `encoded` stays None if `photo_exposure` is available.
-            opacity_factors: [N] factors on the opacities that are rendered, such as those of a dropout.
+            opacity_factors: [N] factors on the opacities that are rendered, at most 1, such as those of a dropout.
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
                 harmonics have in this direction; the harmonics themselves then get no gradient.
         """
         opacities = self.gaussians.opacities()
-        rendered_opacities = opacities if opacity_factors is None else opacities * opacity_factors
+        rendered_opacities = opacities if opacity_factors is None else (opacities * opacity_factors).clamp(max=1)
         ratio = exposure_time / self.base_time
         values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:

@@ -5,9 +5,7 @@ Nothing here waits for a GPU: values are looked at on the CPU alone.
 
 import math
 import operator
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any
 
@@ -16,7 +14,6 @@ import torch
 from torch import Tensor
 
 DEVICES = "cpu", "cuda"
-_accepts_above_1 = ContextVar("accepts_above_1", default=False)
 SINGULAR = 1e-9
 """Least determinant of a camera's rotation, relative to the cube of its largest number."""
 
@@ -114,19 +111,9 @@ def check_render_options(near_plane: Any, alpha_threshold: Any) -> None:
     real("alpha_threshold", alpha_threshold, lambda number: 1e-37 < number < 1.0, "between 1e-37 and 1")
 
 
-@contextmanager
-def opacities_above_1() -> Iterator[None]:
-    """Accept opacities above 1 within the block, such as those that a dropout divides by what is left."""
-    token = _accepts_above_1.set(True)
-    try:
-        yield
-    finally:
-        _accepts_above_1.reset(token)
-
-
 def check_opacities(opacities: Tensor) -> None:
     """Raise ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
-    if opacities.device.type == "cpu" and opacities.numel() and not _accepts_above_1.get():
+    if opacities.device.type == "cpu" and opacities.numel():
         values = opacities.detach()
         low, high = (float(value) for value in values.aminmax())
         if not (math.isfinite(low) and math.isfinite(high)):
