@@ -69,7 +69,7 @@ _floats = wp.array(dtype=wp.float32)
 
 @wp.func
 def active_values(parameters: _floats, active_count: wp.array(dtype=wp.int32), width: int) -> int:
-    """Return how many numbers to update: those of the first active_count[0] rows of `width`, or all if it is empty."""
+    """Return how many numbers to update: those of the first active_count[0] rows of `width`, or all if it is None."""
     count = parameters.shape[0]
     if active_count.shape[0] > 0 and width > 0:
         count = wp.min(count, active_count[0] * width)
@@ -105,7 +105,7 @@ def update_by_adam(
 ):
     """Update every number of PARAMETERS_PER_LAUNCH parameters by Adam, in place; none if skipped[0] is not 0.
 
-    Launched over the longest parameter. step: [1], already counted up; rate: [1]; all of length 0 for an absent
+    Launched over the longest parameter. step: [1], already counted up; rate: [1]; all None for an absent
     parameter. exp_avg, exp_avg_sq: first and second moments. active_count, width_*: as of active_values().
     """
     i = range_start + wp.tid()

@@ -80,13 +80,13 @@ def test_what_needs_no_scene_is_refused_before_one_is_opened(line, message, tmp_
     assert message in capsys.readouterr().err
 
 
-def test_a_missing_folder_is_named_without_loading_torch(tmp_path):
-    code = (
-        "import sys\nfrom sehdr_warp.cli import main\ntry: main(sys.argv[1:])\nfinally: print('torch' in sys.modules)"
-    )
-    words = [sys.executable, "-c", code, "train", "gone", "--out", "x"]
+@pytest.mark.parametrize("line", ["train gone --out x", "render gone --out x --colorspace rec708"])
+def test_a_missing_folder_or_wrong_color_space_is_named_without_loading_what_takes_long(line, tmp_path):
+    code = "import sys\nfrom sehdr_warp.cli import main\ntry: main(sys.argv[1:])\n"
+    code += "finally: print({'torch', 'scipy'} & {*sys.modules})"
+    words = [sys.executable, "-c", code, *line.split()]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and done.stdout == "False\n", done.stderr
+    assert done.returncode == 1 and done.stdout == "set()\n", done.stderr
 
 
 @pytest.mark.parametrize("name", [name for group in cli.COMMANDS.values() for name in group])

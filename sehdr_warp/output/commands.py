@@ -116,6 +116,9 @@ class Render:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
+    from .images.colorspace import color_space
+
+    color_space(args.pictures.colorspace)  # Before anything is loaded
     from .film import write_film
     from .render_views import reframe, render_views, select_cameras
     from .world_transform import world_transform
@@ -151,11 +154,9 @@ def _check_render(args: Render) -> tuple[tuple[float, float], tuple[int, int] | 
     """
     from .aovs import read_aovs
     from .film import check_rate, film_format, film_library
-    from .images.colorspace import color_space
     from .render_views import PATHS, check_bracket_options, check_cameras, may_move, read_size
 
     pictures = args.pictures
-    color_space(pictures.colorspace)
     if args.out is None and args.video is None:
         problem = "render needs --out, a folder for the pictures, or --video, a film"
         raise UsageError(f"{problem}; see sehdr-warp render --help")

@@ -112,8 +112,10 @@ def check_render_options(near_plane: Any, alpha_threshold: Any) -> None:
 
 
 def check_opacities(opacities: Tensor) -> None:
-    """Raise ValueError for opacities on the CPU that are finite and outside of [0, 1]."""
+    """Raise ValueError for opacities on the CPU that are finite and outside of [0, 1], TypeError without memory."""
     if opacities.device.type == "cpu" and opacities.numel():
+        if not opacities.data_ptr():
+            raise TypeError(f"opacities is a {type(opacities).__name__}, which has no memory; pass a plain tensor")
         values = opacities.detach()
         low, high = (float(value) for value in values.aminmax())
         if not (math.isfinite(low) and math.isfinite(high)):

@@ -104,7 +104,7 @@ def rasterize_directions(
         opacities = splats.opacities.masked_fill(~features.isfinite().all(1), 0)
         blended = splats.caps, splats.across, splats.along, opacities, features.contiguous()
         keep_emit_order = means.is_cpu and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in blended)
-        directions = directions.contiguous()
+        directions = directions.detach().contiguous()
         lists = _list_tiles(splats.caps.detach(), splats.distances, directions, keep_emit_order)
         return _Blend.apply(*blended, directions, lists, alpha_threshold)
 
@@ -131,14 +131,15 @@ def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_o
     counts, none = torch.empty_like(order), order[:0]
     launch(kernel, count, *shared, order, counts, none, none, min_range=256)
     cumulative_counts = counts.cumsum(0)
-    length = int(cumulative_counts[-1]) if count else 0
+    total = cumulative_counts[-1] if count else cumulative_counts.new_zeros(())
+    length = int(total)
     check_intersection_count(length, count, grid)
     starts = (cumulative_counts - counts).int()
     tiles, gaussians = (torch.empty(2 * length, dtype=torch.int32, device=order.device) for _ in range(2))
     launch(kernel, count * bool(length), *shared, starts, counts, tiles, gaussians, min_range=256)
     tile_ranges, gaussians, _, emit_indices = lists_by_tile(tiles, gaussians, length, None, grid, keep_emit_order)
     emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
-    return TileLists(tile_ranges, gaussians, None, emit_order, width, height, None, cumulative_counts[-1:])
+    return TileLists(tile_ranges, gaussians, None, emit_order, width, height, None, total.clone())
 
 
 class _Blend(torch.autograd.Function):

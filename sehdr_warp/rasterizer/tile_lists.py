@@ -107,9 +107,9 @@ class TileLists:
     Attributes:
         tile_ranges: [tiles, 2] first intersection of each tile and one past its last.
         gaussians: [M] the Gaussian of each intersection.
-        subtile_masks: [M] uint8, bit k set if the ellipse touches subtile k of its tile; None from the CPU's sort by
-            counting, because only block kernels read them.
-        emit_order: of the intersections before the sort; None unless order_intersections() was told to keep it.
+        subtile_masks: [M] uint8, bit k set if the ellipse touches subtile k of its tile; None where no block kernel
+            reads them: from the CPU's sort by counting, and for rasterize_directions().
+        emit_order: of the intersections before the sort; None unless it was to be kept.
         width: of the image in pixels.
         height: of the image in pixels.
         overflow: scalar bool, whether max_intersections was too few; None without it.

@@ -216,7 +216,7 @@ class ViewerScene:
 def camera_of(values: dict) -> Camera:
     """Return the camera that a page describes.
 
-    Raises ValueError for a bad value, or a picture that is too large; KeyError or TypeError for a wrong field.
+    Raises ValueError for a bad value or too large a picture, KeyError for a missing field, TypeError for a wrong one.
     """
     camera = Camera.from_dict(values)
     if camera.width * camera.height > MOST_PIXELS:

@@ -35,6 +35,8 @@ def test_tensors_without_memory_are_refused_and_leave_nothing_behind():
         poses, lenses = map(mode.from_tensor, place[:2])
         with pytest.raises(TypeError, match="means is a FakeTensor, which has no memory"):
             rasterization(*map(mode.from_tensor, leaves), poses, lenses, *place[2:])
+        with pytest.raises(TypeError, match="opacities is a FakeTensor, which has no memory"):
+            draw(*map(mode.from_tensor, splats(dtype=torch.float32)))
     assert rasterization(*leaves, *place)[0].isfinite().all()
 
 
