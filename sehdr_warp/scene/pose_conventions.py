@@ -38,18 +38,22 @@ def with_fitting_poses(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord
     """
     try:
         with quiet_colmap():
-            from pycolmap import Device, FeatureExtractionOptions, Sift
+            from pycolmap import Bitmap, Device, FeatureExtractionOptions, FeatureExtractor
 
             options = FeatureExtractionOptions()
             options.sift.max_num_features, options.sift.first_octave = 2000, 0  # A photo is not enlarged to find more.
-            sift = Sift(options, Device.cpu)
+            extractor = FeatureExtractor.create(options, Device.cpu)
     except ImportError:
         return list(records), ["poses: not compared with the photos, because pycolmap is not installed"]
     undistortion = cache(Undistortion)
 
+    def extract(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        points, descriptors = extractor.extract(Bitmap.from_array(grey))
+        return np.array([(point.x, point.y) for point in points]).reshape(-1, 2), descriptors.data
+
     @cache
     def features(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        return _features(records[index], sift, undistortion)
+        return _features(records[index], extract, undistortion)
 
     stated: list[float] = []
     others: dict[str, list[float]] = {reading: [] for reading in _READINGS}
@@ -76,7 +80,9 @@ def with_fitting_poses(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord
 
 
 def _features(
-    record: ImageRecord, sift, undistortion: Callable[[Lens], Undistortion]
+    record: ImageRecord,
+    extract: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    undistortion: Callable[[Lens], Undistortion],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return rays [m, 3] and descriptors [m, 128] of a photo, and pixels per unit; None for one that cannot serve."""
     lens = record.lens
@@ -94,7 +100,7 @@ def _features(
         grey = np.rint(unbent.apply(np.repeat(grey[..., None], 3, -1).astype(np.float32)))[..., 0]
     except (InputError, *PILLOW_ERRORS):
         return None
-    places, descriptors = sift.extract(np.ascontiguousarray(np.clip(grey, 0, 255).astype(np.uint8)))
+    places, descriptors = extract(np.ascontiguousarray(np.clip(grey, 0, 255).astype(np.uint8)))
     camera = unbent.camera(record.world_to_camera)
     x, y = (places[:, 0] - camera.cx) / camera.fx, (places[:, 1] - camera.cy) / camera.fy
     rays = np.stack([x, y, np.ones_like(x)], -1).astype(np.float64)
