@@ -248,12 +248,13 @@ def _extract(database: Path, work: Path, names: list[str], model: str, params) -
     reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=camera_params)
     if (work / "masks").exists():
         reader.mask_path = work / "masks"
-    # Threads would number images as they end; the world has the axes of that image of a pair with the lower number.
-    with quiet_colmap(), pycolmap.Database.open(database):
-        pycolmap.import_images(database, work / "images", pycolmap.CameraMode.SINGLE, names, reader)
     for start in range(0, len(names), 8):  # Eight photos at a time, one on each core.
         part = names[start : start + 8]
         with quiet_colmap():
+            # By name: threads would number images as they end, and the world has the axes of one with a low number.
+            with pycolmap.Database.open(database) as opened:
+                pycolmap.import_images(database, work / "images", pycolmap.CameraMode.SINGLE, part, reader)
+                reader.existing_camera_id = opened.read_all_images()[0].camera_id
             options = (database, work / "images", part, pycolmap.CameraMode.SINGLE, reader)
             run_interruptibly(partial(pycolmap.extract_features, *options, device=pycolmap.Device.cpu))
 
