@@ -254,7 +254,7 @@ def _extract(database: Path, work: Path, names: list[str], model: str, params) -
             # By name: threads would number images as they end, and the world has the axes of one with a low number.
             with pycolmap.Database.open(database) as opened:
                 pycolmap.import_images(database, work / "images", pycolmap.CameraMode.SINGLE, part, reader)
-                reader.existing_camera_id = opened.read_all_images()[0].camera_id
+                reader.existing_camera_id = max(image.camera_id for image in opened.read_all_images())
             options = (database, work / "images", part, pycolmap.CameraMode.SINGLE, reader)
             run_interruptibly(partial(pycolmap.extract_features, *options, device=pycolmap.Device.cpu))
 
