@@ -117,7 +117,7 @@ def test_a_small_file_keeps_its_mark_in_a_large_one(tmp_path, run, suffix):
 
 
 def test_filters_of_other_gaussians_are_refused(tmp_path, run):
-    """As a program leaves them that removes Gaussians from a stage and does not know of the filter."""
+    """A program that does not know of the filter removes Gaussians from a stage."""
     Usd = pytest.importorskip("pxr.Usd")
     file = export(run, tmp_path / "a.usda", axes="scene")
     stage = Usd.Stage.Open(str(file))

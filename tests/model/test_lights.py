@@ -218,7 +218,7 @@ def test_errors_of_unclipped_values_count_if_these_measure_a_light():
 
 
 def test_bright_places_that_darker_photos_alone_show_are_no_lights():
-    """As of a walk from a room into the sun, where the camera shortens its exposure."""
+    """Build a walk from a room into the sun, where the camera shortens its exposure."""
     scene = field(np.concatenate([panel(6, 4, 0.12), panel(6, 4, 0.12, at=(0, 0, -4.0))]), (0.3, 0.3, 0.3), 0.08)
     outside = scene.gaussians.means[:, 2] < 0
     scene.gaussians.harmonics_dc.data[outside] *= 64

@@ -38,7 +38,7 @@ def blocks(monkeypatch):
 
 
 def leaves_and_lists(scene):
-    """What blend() takes: splats whose tensors are leaves, lists and packed Gaussians."""
+    """Return arguments of blend(): splats whose tensors are leaves, lists and packed Gaussians."""
     gaussians, splats = projected(scene), packed(scene)
     lists = build_tile_lists(splats, order_intersections(splats), scene.width, scene.height)
     leaves = [tensor.detach().requires_grad_() for tensor in (*gaussians, scene.tensors[4])]

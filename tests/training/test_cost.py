@@ -108,7 +108,7 @@ def test_recommendations():
 
 
 def test_masks_and_wide_codes_count_as_photos():
-    """As they lie on the device: codes of one type, and a mask for each photo if one has a mask."""
+    """Photos on the device have codes of one type, and a mask for each photo if one has a mask."""
     views = list(toy_scene().views)
     pixels = sum(view.codes.shape[0] * view.codes.shape[1] for view in views if view.split == "train")
 

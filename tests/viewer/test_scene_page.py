@@ -183,8 +183,8 @@ def test_lamps_smaller_than_a_pixel_keep_their_light(tmp_path, focal, antialiase
     file = write_scene_page(scene, tmp_path / "lamps.html")
     with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
         page.wait_for_selector(FULL)
-        seen = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
-        shown = pixels(page, "#picture")
-        rendered = scene.render_ldr(seen).numpy()
-        assert seen.fx == pytest.approx(300)
-        assert -10 * np.log10(np.mean((shown - rendered) ** 2)) > 50
+        page_camera = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
+        picture = pixels(page, "#picture")
+        rendered = scene.render_ldr(page_camera).numpy()
+        assert page_camera.fx == pytest.approx(300)
+        assert -10 * np.log10(np.mean((picture - rendered) ** 2)) > 50

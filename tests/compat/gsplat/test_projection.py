@@ -54,7 +54,7 @@ def test_covariances_and_cameras_are_projected_alike(model, device):
 
 
 def test_the_upper_triangle_of_covariances_is_read_alone(device):
-    """As gsplat does: the lower one changes nothing and gets no gradient."""
+    """The lower triangle changes nothing and gets no gradient, as in gsplat."""
     leaves, place = scene(device, count=12)
     symmetric = quat_scale_to_covar_preci(leaves[1], leaves[2])[0].detach()
     upper = symmetric.triu().requires_grad_()
