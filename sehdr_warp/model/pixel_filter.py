@@ -7,7 +7,7 @@ small Gaussians shrink, and a lamp loses most of its light. With a shorter one i
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from .renders import CameraTensors
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
 TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
 MOST_CAMERAS = 128  # Each takes a few tenths of a second of a million Gaussians.
+MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
 NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
 
 
@@ -49,6 +50,21 @@ class FocalRange(NamedTuple):
         """Return the variance of the photos' filter in square pixels of a render with a focal length in pixels."""
         ratio = focal / self.nearest(focal)
         return EPS2D if abs(ratio - 1) < ROUNDING else EPS2D * ratio**2
+
+
+def samples_across_pixel(field: Any, camera: Camera) -> int:
+    """Return how many times finer than a camera's pixels a scene must be rendered to give lamps the photos' light.
+
+    1 for cameras that are not pinholes, and without photos. A wide view has at most MOST_PIXELS finer ones.
+
+    Args:
+        field: A RadianceField or PagedField.
+        camera: In any coordinates.
+    """
+    if field.photo_focals is None or field.antialiased or not camera.is_pinhole:
+        return 1
+    finest = max(1, math.isqrt(MOST_PIXELS // (camera.width * camera.height)))
+    return min(field.photo_focals.samples(camera.fx), finest)
 
 
 def photo_filters(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -50,6 +50,8 @@ class RenderedView:
 
     def reduced(self, factor: int) -> "RenderedView":
         """Return the view at a size that is smaller by an integer factor: the mean of each factor x factor pixels."""
+        if factor == 1:
+            return self
         covered = torch.stack([self.alpha, self.alpha * self.depth])
         images = avg_pool2d(torch.cat([self.hdr.permute(2, 0, 1), covered]), factor)
         alpha = images[3]

@@ -12,7 +12,6 @@ import numpy as np
 from ..errors import SehdrError, did_you_mean
 from ..scene import Camera
 from ..scene.wide_camera import pixel_directions
-from .averaging import render_averaged
 from .images.exr import Part, as_data
 from .images.ldr_files import as_array
 from .world_transform import WorldTransform
@@ -46,7 +45,7 @@ class ViewImages:
 
 def render_images(run: "RenderableScene", camera: Camera, transform: WorldTransform) -> ViewImages:
     """Render a view from a camera in the scene's coordinates; `transform` leads to those of the file."""
-    view, confidence = render_averaged(run, camera), run.render_confidence(camera)
+    view, confidence = run.render(camera), run.render_confidence(camera)
     confidence = None if confidence is None else as_array(confidence)
     hdr, alpha, depth = (as_array(values) for values in (view.hdr, view.alpha, view.depth))
     depth = depth * np.float32(transform.scale)

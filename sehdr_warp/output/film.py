@@ -18,7 +18,6 @@ from ..errors import InputError, SehdrError, refuse_paths, require_extra
 from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
-from .averaging import render_averaged
 from .images.colorspace import color_space, matrix_to
 from .images.ldr_files import as_array
 from .images.tonemap import display_gain, encode_srgb
@@ -131,7 +130,7 @@ def write_film(
             with av.open(name, "w", format=container_format, options=options) as container:
                 stream = _add_stream(container, kind, fps, width, height)
                 for camera, ev in zip(_with_progress(cameras, out, tell), stops):
-                    hdr = as_array(render_averaged(run, camera.resized(width, height)).hdr) * np.float32(2.0**ev)
+                    hdr = as_array(run.render(camera.resized(width, height)).hdr) * np.float32(2.0**ev)
                     encoded = tone_map(hdr) if tone_map else encode(hdr * np.float32(gain), transfer)
                     for packet in stream.encode(_frame(av, encoded, kind)):
                         container.mux(packet)

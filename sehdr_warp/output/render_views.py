@@ -231,7 +231,8 @@ def _camera_files(
 
 def shared_tone_map(run: "RenderableScene", cameras: Sequence[Camera]) -> ToneMap:
     """Return one tone map for all pictures of some cameras, fitted to a few small renders."""
-    return fit_tone_map([as_array(run.render(camera.within(_FIT_SIZE)).hdr) for camera in evenly(cameras, _FIT_VIEWS)])
+    small = [camera.within(_FIT_SIZE) for camera in evenly(cameras, _FIT_VIEWS)]
+    return fit_tone_map([as_array(run.render(camera, average=False).hdr) for camera in small])
 
 
 def read_size(size: str | tuple[int, int]) -> tuple[int, int]:

@@ -42,9 +42,10 @@ class SavedRun:
         """Set the run, and what calls a function on the renderer, see Viewer.on_renderer."""
         self._on_renderer, self._run, self.client = on_renderer, run, client
 
-    def render(self, camera: Any) -> Any:
-        """Render a camera."""
-        return self._on_renderer(self.client, partial(self._run.render, camera), camera.width * camera.height)
+    def render(self, camera: Any, **options: bool) -> Any:
+        """Render a camera, with options of RenderableScene.render()."""
+        render = partial(self._run.render, camera, **options)
+        return self._on_renderer(self.client, render, camera.width * camera.height)
 
     def render_confidence(self, camera: Any) -> Any:
         """Render confidence."""

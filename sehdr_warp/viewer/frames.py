@@ -137,10 +137,10 @@ class ViewerScene:
         """True if pictures are made on the CPU."""
         return str(getattr(self.run, "device", "cpu")) == "cpu"
 
-    def render(self, camera: Camera):
-        """Render a camera while no other thread changes the scene."""
+    def render(self, camera: Camera, **options: bool):
+        """Render a camera, with options of RenderableScene.render(), while no other thread changes the scene."""
         with self.lock.rendering():
-            return self.run.render(camera)
+            return self.run.render(camera, **options)
 
     def render_confidence(self, camera: Camera) -> Tensor | None:
         """Render confidence while no other thread changes the scene."""
@@ -158,7 +158,7 @@ class ViewerScene:
         """
         run, shares, size = self.run, self.clipped if clipped else None, (camera.height, camera.width)
         with torch.no_grad():
-            rendered = self.render(camera)
+            rendered = self.render(camera, average=False)
             light, depth = torch.as_tensor(rendered.hdr), torch.as_tensor(rendered.depth)
             frame = torch.empty((5 + (shares is not None), *size), dtype=torch.float16, device=light.device)
             picture = frame[:4].view(*size, 4)

@@ -59,8 +59,8 @@ class LiveTraining(ViewerScene):
             raise AttributeError(name)
         return attributes[name]
 
-    def render(self, camera: Camera):
-        """Render between two steps."""
+    def render(self, camera: Camera, **options: bool):
+        """Render between two steps; options change nothing, because a scene under training is never averaged."""
         return self._between_steps(lambda: self.run.render(camera))
 
     def frame_parts(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> Iterator[memoryview]:

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +10,9 @@ import torch
 from sehdr_warp import Camera, load_run
 from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
-from sehdr_warp.model.pixel_filter import FocalRange, keep_light, photo_filters
+from sehdr_warp.model.pixel_filter import FocalRange, keep_light, photo_filters, samples_across_pixel
 from sehdr_warp.model.radiance_field import RadianceField
-from sehdr_warp.model.renders import CameraTensors, RenderedView
-from sehdr_warp.output.averaging import render_averaged
+from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.rasterizer.reference import project_reference
 from sehdr_warp.response import response_by_name
 
@@ -126,32 +124,26 @@ def test_pictures_of_half_the_size_are_means_of_the_photos_pixels(embedded_run):
     run = load_run(embedded_run)
     camera = run.cameras[0].camera
     even = camera.resized(camera.width // 2 * 2, camera.height // 2 * 2)
-    full, half = run.render(even), render_averaged(run, even.resized(even.width // 2, even.height // 2))
+    full, half = run.render(even), run.render(even.resized(even.width // 2, even.height // 2))
     means = full.hdr.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2))
     torch.testing.assert_close(half.hdr, means, rtol=1e-4, atol=1e-5)
+    once = run.render(even.resized(even.width // 2, even.height // 2), average=False)
+    assert float((once.hdr - half.hdr).abs().max()) > 0.01
     assert half.depth.shape == half.alpha.shape == half.hdr.shape[:2]
 
 
 @pytest.mark.parametrize(
-    ("camera", "antialiased", "size"),
+    ("camera", "antialiased", "samples"),
     [
-        (PHOTO.resized(12, 9), False, (48, 36)),
-        (PHOTO.resized(12, 9), True, (12, 9)),
-        (FISHEYE.resized(12, 9), False, (12, 9)),
-        (replace(PHOTO, width=2400, height=1800, fx=1.0, fy=1.0), False, (2400, 1800)),
+        (PHOTO.resized(12, 9), False, 4),
+        (PHOTO.resized(12, 9), True, 1),
+        (FISHEYE.resized(12, 9), False, 1),
+        (replace(PHOTO, width=2400, height=1800, fx=1.0, fy=1.0), False, 1),
     ],
     ids=["coarse", "antialiased", "fisheye", "very wide"],
 )
-def test_pixels_are_finer_where_that_is_needed_and_fits_into_memory(camera, antialiased, size):
-    sizes = []
-
-    def render(camera):
-        sizes.append((camera.width, camera.height))
-        return RenderedView(torch.zeros(camera.height, camera.width, 3), *torch.zeros(2, camera.height, camera.width))
-
-    run = SimpleNamespace(field=SimpleNamespace(antialiased=antialiased, photo_focals=FOCALS), render=render)
-    assert render_averaged(run, camera).hdr.shape == (camera.height, camera.width, 3)
-    assert sizes == [size]
+def test_pixels_are_finer_where_that_is_needed_and_fits_into_memory(camera, antialiased, samples):
+    assert samples_across_pixel(lamps(antialiased=antialiased), camera) == samples
 
 
 def test_rendered_files_of_any_size_hold_the_same_light(embedded_run, tmp_path):

@@ -93,7 +93,7 @@ class AnalyticRun:
     def clipped_share(self):
         return None
 
-    def render(self, view):
+    def render(self, view, *, average=True):
         self.rendered += 1
         y, x = np.mgrid[: view.height, : view.width] + 0.5
         rays = (

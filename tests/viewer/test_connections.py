@@ -82,10 +82,10 @@ class _Slow(AnalyticRun):
 
     renders = 0
 
-    def render(self, camera):
+    def render(self, camera, *, average=True):
         self.renders += 1
         time.sleep(0.02)
-        return super().render(camera)
+        return super().render(camera, average=average)
 
 
 def slow(server):
