@@ -5,6 +5,7 @@ from .evaluation.compare import compare_runs
 from .evaluation.evaluate import evaluate
 from .evaluation.folder import evaluate_folder
 from .output.brackets import write_brackets
+from .output.cameras.selection import select_cameras
 from .output.export.gaussians import export
 from .output.export.proxy_mesh import write_proxy_mesh
 from .output.export.splat_edits import SplatEdits
@@ -12,7 +13,7 @@ from .output.film import write_film
 from .output.lighting.environment_map import write_environment_map
 from .output.lighting.lights import write_lights
 from .output.merged_scene import MergedScene, merge_scenes
-from .output.render_views import render_views, select_cameras
+from .output.render_views import render_views
 from .output.report.write import write_report
 from .output.scene_page import write_scene_page
 from .output.world_transform import write_orientation

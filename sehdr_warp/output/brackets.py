@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
-from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,18 +17,18 @@ from ..files import atomic_folder, atomic_path, remove, write_json
 from ..model.exposure import Exposure, Items, read_exposures
 from ..own_files import is_own
 from ..scene import Camera
-from .images.colorspace import color_space, from_rec709
+from .images.colorspace import from_rec709
 from .images.exr import (
     PAST_HALF,
     Part,
     check_finite,
     check_pixel_type,
-    exr_header,
     rgb_channels,
     stored_pixel_type,
     write_multipart_exr,
 )
 from .images.ldr_files import exposure_exif, quantize, safe_names, write_picture
+from .picture_header import PictureHeader
 
 log = logging.getLogger(__name__)
 LDR_FORMATS = ("jpeg", "png", "png16")
@@ -150,35 +149,6 @@ def remove_earlier(out: Path, names: Iterable[str]) -> None:
             log.info("%s: removed, because an earlier call wrote it and this one does not", path)
         elif os.path.lexists(path):
             log.warning("%s: stays, though this call did not write it: it is yours, or was changed", path)
-
-
-@dataclass(frozen=True)
-class PictureHeader:
-    """EXR attributes that all pictures of a render share.
-
-    Attributes:
-        base_time: Seconds at 0 EV.
-        colorspace: Primaries of the EXR files.
-        captured: Local time that the files state as that of the picture.
-        provenance: Text by key.
-        luminance_of_one: cd/m^2 of a radiance of 1; None if it is not known.
-    """
-
-    base_time: float
-    colorspace: str = "rec709"
-    captured: datetime | None = None
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    luminance_of_one: float | None = None
-
-    def __post_init__(self) -> None:
-        """Raise SehdrError for an unknown color space."""
-        color_space(self.colorspace)
-
-    def attributes(self, view: str, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
-        """Return the EXR attributes of a picture."""
-        values = {**self.provenance, **provenance, "view": view, "baseExposureTime": repr(float(self.base_time))}
-        luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
-        return exr_header(self.colorspace, exposure_time, camera, self.captured, values, luminance)
 
 
 @dataclass(frozen=True)

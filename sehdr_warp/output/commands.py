@@ -116,28 +116,25 @@ class Render:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
-    from .images.colorspace import color_space
-
-    color_space(args.pictures.colorspace)  # Before anything is loaded
+    from .cameras.selection import select_cameras
     from .film import write_film
-    from .render_views import reframe, render_views, select_cameras
+    from .render_views import render_views
     from .world_transform import world_transform
 
-    ramp, size = _check_render(args)
+    _check_render(args)
+    ramp = _ramp(args.film.ev_ramp)
     run = open_scene(args.run, args.device)
     default_count = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
     count = default_count if args.count is None else args.count
-    selection, files, summary = {"cameras": args.cameras, "camera": args.camera, "count": count}, [], ""
-    fps = args.film.fps
+    selection = {"cameras": args.cameras, "camera": args.camera, "count": count, "size": args.size}
+    files, fps, summary = [], args.film.fps, ""
     if args.out is not None:
         groups = vars(args.world) | vars(args.pictures)  # Their fields are arguments of render_views().
-        files = render_views(run, args.out, size=size, overwrite=args.overwrite, fps=fps, **selection, **groups)
+        files = render_views(run, args.out, overwrite=args.overwrite, fps=fps, **selection, **groups)
         summary = f"{args.out}: {len(files)} files"
     if args.video is not None:
         transform = world_transform(run, **vars(args.world))
         cameras = [camera for _, camera in select_cameras(run, **selection, transform=transform, up=args.world.up)]
-        if size is not None:
-            cameras = [reframe(camera, *size) for camera in cameras]
         film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}
         files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
         if len(cameras) == 1:
@@ -147,16 +144,15 @@ def run_render(args: Render) -> None:
     print(json.dumps({"files": [str(path) for path in files]}) if args.json else summary)
 
 
-def _check_render(args: Render) -> tuple[tuple[float, float], tuple[int, int] | None]:
-    """Check the options before a scene is loaded, which takes seconds; return the ramp of stops and the size.
+def _check_render(args: Render) -> None:
+    """Check the options before a scene is loaded, which takes seconds.
 
     Raises UsageError or SehdrError for options that do not fit each other or are out of range.
     """
-    from .aovs import read_aovs
+    from .cameras.selection import PATHS, may_move
     from .film import check_rate, film_format, film_library
-    from .render_views import PATHS, check_bracket_options, check_cameras, may_move, read_size
+    from .render_views import check_options
 
-    pictures = args.pictures
     if args.out is None and args.video is None:
         problem = "render needs --out, a folder for the pictures, or --video, a film"
         raise UsageError(f"{problem}; see sehdr-warp render --help")
@@ -165,23 +161,19 @@ def _check_render(args: Render) -> tuple[tuple[float, float], tuple[int, int] | 
         flags = [flag for flag in flags if flag != "--fps"]  # Files of a moving camera state it, too.
     if args.video is None and flags:
         raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
-    if args.out is None and (flags := changed_flags(pictures)):
+    if args.out is None and (flags := changed_flags(args.pictures)):
         raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
-    check_cameras(args.cameras)
+    pictures = dict(vars(args.pictures))
+    brackets = [pictures.pop("evs"), pictures.pop("exposures")]
+    del pictures["reference_white"]
+    check_options(args.cameras, args.size, pictures.pop("aovs"), brackets != [None, None], **pictures)
     if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
-    ramp = _ramp(args.film.ev_ramp)
     check_rate(args.film.fps)
-    if pictures.aovs:
-        read_aovs(pictures.aovs)
-    brackets = {"multipart": pictures.multipart, "ldr_brackets": pictures.ldr_brackets, "group_by": pictures.group_by}
-    check_bracket_options(pictures.evs is not None or pictures.exposures is not None, **brackets)
-    size = None if args.size is None else read_size(args.size)
     if args.video is not None:
         film_library()
         film_format(args.video)
         check_absent(args.video, args.overwrite)
-    return ramp, size
 
 
 def _ramp(text: str | None) -> tuple[float, float]:

@@ -1,46 +1,36 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
-import json
 import logging
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, SehdrError, did_you_mean, refuse_paths
+import numpy as np
+
+from ..errors import SehdrError, refuse_paths
 from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
 from ..progress import track_progress
 from ..scene import Camera
-from ..scene.camera import MAX_SIDE
-from ..scene.images.ldr_files import MAX_PIXELS
-from ..scene.readers.camera_exchange import EXCHANGE_SUFFIXES
-from ..scene.readers.camera_files import read_camera_file
-from ..splats import cameras_beside
 from ..subsets import evenly, first_names
-from .aovs import ViewImages, data_parts, read_aovs, render_images
-from .brackets import Brackets, PictureHeader, bracket_exposures, remove_earlier
+from .aovs import data_parts, read_aovs
+from .brackets import Brackets, bracket_exposures, remove_earlier
 from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
-from .cameras.framing import default_path, film_camera
-from .cameras.paths import interpolate
-from .cameras.scene_cameras import training_cameras
-from .images.colorspace import from_rec709
+from .cameras.selection import check_cameras, may_move, read_size, select_cameras
+from .images.colorspace import color_space, from_rec709
 from .images.exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
-from .images.ldr_files import as_array, quantize, safe_names, write_picture
+from .images.ldr_files import as_array, quantize, write_picture
 from .images.ocio import ocio_view
 from .images.tonemap import ToneMap, exposure_of_white, fit_tone_map
-from .lighting.unit import luminance_of_one, read_light_unit
+from .picture_header import PictureHeader
+from .view_images import ViewImages, render_images
 from .world_transform import WorldTransform, from_photos, stored_matrix, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
-SPLITS = ("train", "test", "all")
-PATHS = ("orbit", "interpolate")
 
 _FIT_VIEWS, _FIT_SIZE = 4, 160  # Number and longest side of the pictures that a tone map is fitted to
 _LEAST_ALPHA = 0.01  # Mean coverage below which a picture counts as empty: stray Gaussians are nearly everywhere
@@ -116,13 +106,17 @@ def render_views(
         InputError: If a file would be replaced or a pixel is not finite.
     """
     refuse_paths("load_run", run)
+    has_brackets = evs is not None or exposures is not None
+    options = {"multipart": multipart, "ldr_brackets": ldr_brackets, "group_by": group_by, "ocio": ocio, "view": view}
+    check_options(cameras, size, aovs, has_brackets, colorspace=colorspace, pixel=pixel, **options)
     out = Path(out)
     transform = world_transform(run, axes, up=up, scale=scale)
-    facts = provenance(run) | {"worldMatrix": json.dumps(stored_matrix(run, transform).tolist())}
-    now = datetime.now().replace(microsecond=0)
-    header = PictureHeader(run.base_time, colorspace, now, facts, luminance_of_one(run))
+    views = select_cameras(run, cameras, camera=camera, count=count, size=size, transform=transform, up=up)
+    camera_files = _camera_files(run, views, transform, fps, moves=may_move(cameras))
+    header = PictureHeader.of(run, transform, colorspace)
+    hdr_exposure = exposure_of_white(run, reference_white)
     brackets = None
-    if evs is not None or exposures is not None:
+    if has_brackets:
         brackets = Brackets(
             exposures=bracket_exposures(run.base_time, evs=evs, exposures=exposures),
             header=header,
@@ -132,19 +126,10 @@ def render_views(
             response=run.response,
             group_by=group_by,
         )
-    check_bracket_options(brackets is not None, multipart=multipart, ldr_brackets=ldr_brackets, group_by=group_by)
-    check_pixel_type(pixel)
-    hdr_exposure = exposure_of_white(run, reference_white)
-    if (ocio is None) != (view is None):
-        raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
-    to_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
-    aovs = read_aovs(aovs) if aovs else ()
-    views = select_cameras(run, cameras, camera=camera, count=count, transform=transform, up=up)
-    if size is not None:
-        width, height = read_size(size)
-        views = [(name, reframe(camera, width, height)) for name, camera in views]
-    camera_files = _camera_files(run, views, transform, fps, moves=may_move(cameras))
-    empty = []
+    to_display: Callable[[np.ndarray], np.ndarray] | None = None
+    if ocio is not None and view is not None:
+        to_display = ocio_view(ocio, view, exposure_of_white(run, 1.0))
+    aov_names, empty = read_aovs(aovs), []
     with ExitStack() as stack:  # Closed in reverse order: brackets take their place first, cameras last.
         for name, text in camera_files.items():
             stack.enter_context(atomic_path(out / name, overwrite)).write_text(text, encoding="utf-8")
@@ -157,7 +142,7 @@ def render_views(
             if images.confidence is None and index == 0:
                 log.info("without a confidence channel; for a run, `sehdr-warp report` measures it, from the photos")
             attributes = header.attributes(name, hdr_exposure, images.camera_in_file)
-            parts = _hdr_parts(images, attributes, colorspace, hdr_exposure, aovs)
+            parts = _hdr_parts(images, attributes, colorspace, hdr_exposure, aov_names)
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
             write_picture(preview_folder / f"{name}.png", quantize(to_display(images.hdr)))
@@ -179,15 +164,31 @@ def render_views(
     return files
 
 
-def check_bracket_options(has_exposures: bool, *, multipart: bool, ldr_brackets: str | None, group_by: str) -> None:
-    """Raise SehdrError for options of brackets without exposures; arguments as of render_views."""
-    if not has_exposures and (multipart or ldr_brackets or group_by != "view"):
+def check_options(
+    cameras: str | Path,
+    size: str | tuple[int, int] | None,
+    aovs: str | Sequence[str],
+    has_brackets: bool,
+    *,
+    colorspace: str,
+    pixel: str,
+    multipart: bool,
+    ldr_brackets: str | None,
+    group_by: str,
+    ocio: str | None,
+    view: str | None,
+) -> None:
+    """Raise the errors of render_views() that need no scene, whose loading takes seconds; arguments as there."""
+    check_cameras(cameras)
+    if size is not None:
+        read_size(size)
+    read_aovs(aovs)
+    if not has_brackets and (multipart or ldr_brackets or group_by != "view"):
         raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
-
-
-def may_move(cameras: str | Path) -> bool:
-    """Return whether a choice of cameras may be one that moves; those of the run and of a COLMAP model are photos."""
-    return str(cameras) in PATHS or (str(cameras) not in SPLITS and not Path(cameras).is_dir())
+    color_space(colorspace)
+    check_pixel_type(pixel)
+    if (ocio is None) != (view is None):
+        raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
 
 
 def _hdr_parts(
@@ -233,116 +234,3 @@ def shared_tone_map(run: "RenderableScene", cameras: Sequence[Camera]) -> ToneMa
     """Return one tone map for all pictures of some cameras, fitted to a few small renders."""
     small = [camera.within(_FIT_SIZE) for camera in evenly(cameras, _FIT_VIEWS)]
     return fit_tone_map([as_array(run.render(camera, average=False).hdr) for camera in small])
-
-
-def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
-    """Return width and height in pixels from "1920x1080" or a pair; raise SehdrError for anything else."""
-    try:
-        width, height = (int(side) for side in (size.lower().split("x") if isinstance(size, str) else size))
-    except (ValueError, TypeError):
-        width = height = 0
-    if min(width, height) < 1 or max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
-        raise SehdrError(f"size {size!r} is not usable; write width and height in pixels, such as 1920x1080")
-    return width, height
-
-
-def reframe(camera: Camera, width: int, height: int) -> Camera:
-    """Return a camera of another size with the same vertical field of view and pixel aspect ratio.
-
-    The picture shows more or less at the sides. Raises SehdrError for a panorama that is not twice as wide as high.
-    """
-    if camera.projection == "equirectangular" and width != 2 * height:
-        raise SehdrError(f"size {width}x{height} would distort a panorama; write one twice as wide as high")
-    scale = height / camera.height
-    cx = width / 2 + (camera.cx - camera.width / 2) * scale
-    intrinsics = {"fx": camera.fx * scale, "fy": camera.fy * scale, "cx": cx, "cy": camera.cy * scale}
-    return replace(camera, width=width, height=height, **intrinsics)
-
-
-def check_cameras(cameras: str | Path) -> None:
-    """Raise SehdrError if a choice of cameras is neither a known word nor a file."""
-    words = (*SPLITS, *PATHS)
-    if str(cameras) not in words and not Path(cameras).exists():
-        hint = did_you_mean(str(cameras), words)
-        raise SehdrError(f"cameras {str(cameras)!r} are neither a file nor one of {', '.join(words)}{hint}")
-
-
-def select_cameras(
-    run: "RenderableScene",
-    cameras: str | Path,
-    *,
-    camera: str | None = None,
-    count: int = 60,
-    transform: WorldTransform | None = None,
-    up: str | Sequence[float] | None = None,
-) -> list[tuple[str, Camera]]:
-    """Return named cameras in the scene's coordinates; the names are safe for files and all different.
-
-    Args:
-        run: From load_run, train or load_splats.
-        cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
-        camera: Only this camera of a file.
-        count: Views of an orbit or interpolation.
-        transform: From the scene's coordinates to those of camera files that other programs write (OpenUSD, .chan); by
-            default that to upright coordinates.
-        up: As in world_transform, for an orbit.
-
-    Raises:
-        SehdrError: If there are none, or `cameras` is neither a known name nor a file.
-    """
-    refuse_paths("load_run", run)
-    check_cameras(cameras)
-    text, choices = str(cameras), ", ".join(SPLITS + PATHS)
-    if camera is not None and text in SPLITS + PATHS:
-        raise SehdrError(f"--camera {camera}: chooses from a file of cameras, which --cameras {text} is not")
-    if text in SPLITS:
-        views = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
-        if not views:
-            others = choices.replace(f"{text}, ", "")
-            raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
-    elif text in PATHS:
-        if text == "orbit":
-            path = default_path(run, count, up)
-        else:
-            photos = training_cameras(run)
-            path = [film_camera(each, photos) for each in interpolate(photos, count)]
-        digits = max(3, len(str(count - 1)))
-        return [(f"{text}_{index:0{digits}d}", camera) for index, camera in enumerate(path)]
-    else:
-        views = _from_file(run, Path(cameras), transform)
-        if camera is not None:
-            names = [name for name, _ in views]
-            # Frames of a moving camera are named as by read_exchange_cameras(): numbers of four characters or more.
-            frames = re.compile(re.escape(camera) + r"_[-\d.]{4,}")
-            views = [view for view in views if view[0] == camera] or [
-                view for view in views if frames.fullmatch(view[0])
-            ]
-            if not views:
-                raise SehdrError(f"{cameras}: has no camera {camera!r}{did_you_mean(camera, names)}")
-    return list(zip(safe_names([name for name, _ in views]), [camera for _, camera in views], strict=True))
-
-
-def _from_file(run: "RenderableScene", path: Path, transform: WorldTransform | None) -> list[tuple[str, Camera]]:
-    """Return the cameras of a file in the scene's coordinates."""
-    file = read_camera_file(path)
-    views, steps = file.cameras, [from_photos(run)]  # Most files are in the photos' coordinates.
-    if file.world_matrix is not None:
-        try:
-            steps.insert(0, WorldTransform.from_matrix(file.world_matrix).inverse())
-        except ValueError as error:
-            raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
-    elif path.suffix.lower() in EXCHANGE_SUFFIXES:
-        steps = [(transform or world_transform(run)).inverse()]
-    elif run.world_matrix is not None and (own := cameras_beside(Path(run.path))) is not None and own.samefile(path):
-        steps = []  # They are in the coordinates of the Gaussians beside.
-    for step in steps:
-        views = [(name, step.camera(camera)) for name, camera in views]
-    return views
-
-
-def provenance(run: "RenderableScene") -> dict[str, str]:
-    """Return where a picture came from, as text by key."""
-    unit = read_light_unit(run)
-    values = {"scene": run.scene_name, "iterations": run.iterations, "units": str(unit or "relative radiance")}
-    values["response"] = getattr(run.response, "name", None)
-    return {key: str(value) for key, value in values.items() if value not in (None, "")}

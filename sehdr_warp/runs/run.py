@@ -109,15 +109,13 @@ class RenderableScene:
     def render(self, camera: Camera, *, average: bool = True) -> RenderedView:
         """Render HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera.
 
-        Args:
-            camera: In the scene's coordinates.
-            average: Render a pinhole view that is coarser than the photos as finely as they are, and average it. False
-                is faster, but lamps smaller than a pixel get 0.7 to 1.6 times their light, and edges are rough.
+        With `average`, a pinhole view that is coarser than the photos is rendered as finely as they are and averaged.
+        Without it, which is faster, lamps smaller than a pixel get 0.7 to 1.6 times their light, and edges are rough.
         """
         factor = samples_across_pixel(self.field, camera) if average else 1
         finer = camera.resized(factor * camera.width, factor * camera.height)
-        view = self.field.render(finer, degree=self.degree)
-        return as_rec709(view, self.color_matrix, self.field).reduced(factor)
+        view = as_rec709(self.field.render(finer, degree=self.degree), self.color_matrix, self.field)
+        return view.reduced(factor)
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float, **more: Any

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.export.proxy_mesh import write_proxy_mesh
 from sehdr_warp.output.images.exr import exr_header, rgb_channels, write_exr
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
-from sehdr_warp.output.render_views import render_views, select_cameras
+from sehdr_warp.output.render_views import render_views
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.scene.images.hdr_files import read_hdr
 

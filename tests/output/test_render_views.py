@@ -8,9 +8,10 @@ from PIL import Image
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.cameras.paths import interpolate, orbit
 from sehdr_warp.output.cameras.scene_cameras import common_focus
+from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.images.ldr_files import safe_names
 from sehdr_warp.output.images.tonemap import display_gain
-from sehdr_warp.output.render_views import render_views, select_cameras
+from sehdr_warp.output.render_views import render_views
 from sehdr_warp.own_files import LIST
 from sehdr_warp.scene import Camera, load_cameras
 
@@ -276,8 +277,8 @@ def test_cameras_that_see_nothing_are_warned_of(tmp_path, logged, monkeypatch):
     run = AnalyticRun()
     rendered = run.render
 
-    def nothing(view):
-        image = rendered(view)
+    def nothing(view, **options):
+        image = rendered(view, **options)
         image.alpha *= 0.001
         return image
 

@@ -10,9 +10,10 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.cameras.exchange import camera_path
 from sehdr_warp.output.cameras.paths import orbit
+from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.lighting.environment_map import write_environment_map
-from sehdr_warp.output.render_views import render_views, select_cameras
+from sehdr_warp.output.render_views import render_views
 from sehdr_warp.output.world_transform import WorldTransform, from_photos, world_transform, write_orientation
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera, load_cameras, load_scene, look_at

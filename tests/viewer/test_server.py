@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.output.render_views import select_cameras
+from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.runs.open import open_scene
 from sehdr_warp.scene import load_cameras, look_at

@@ -18,7 +18,7 @@ from ..images.colorspace import color_space, from_rec709
 from ..images.exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr, write_radiance
 from ..images.ldr_files import as_array
 from ..images.tonemap import exposure_of_white
-from ..render_views import provenance
+from ..picture_header import provenance
 from ..world_transform import AXES, WorldTransform, stored_matrix, world_transform
 from .map_center import MapCenter, find_center
 from .shares import light_shares

@@ -18,7 +18,7 @@ from ..cameras.scene_cameras import training_cameras
 from ..images.exr import rgb_channels, write_exr
 from ..images.ldr_files import as_array
 from ..images.tonemap import exposure_of_white
-from ..render_views import provenance
+from ..picture_header import provenance
 from ..world_transform import WorldTransform, world_transform
 from .environment_map import COVERED, inpainted_light, latlong, map_header, render_map, solid_angles
 from .map_center import MapCenter, find_center

@@ -1,0 +1,139 @@
+"""Choose the cameras of a render: views of a run, a path through the scene, or those of a file."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...errors import InputError, SehdrError, did_you_mean, refuse_paths
+from ...scene import Camera
+from ...scene.camera import MAX_SIDE
+from ...scene.images.ldr_files import MAX_PIXELS
+from ...scene.readers.camera_exchange import EXCHANGE_SUFFIXES
+from ...scene.readers.camera_files import read_camera_file
+from ...splats import cameras_beside
+from ..images.ldr_files import safe_names
+from ..world_transform import WorldTransform, from_photos, world_transform
+from .framing import default_path, film_camera
+from .paths import interpolate
+from .scene_cameras import training_cameras
+
+if TYPE_CHECKING:
+    from ...runs.run import RenderableScene
+
+SPLITS = ("train", "test", "all")
+PATHS = ("orbit", "interpolate")
+
+
+def select_cameras(
+    run: "RenderableScene",
+    cameras: str | Path,
+    *,
+    camera: str | None = None,
+    count: int = 60,
+    size: str | tuple[int, int] | None = None,
+    transform: WorldTransform | None = None,
+    up: str | Sequence[float] | None = None,
+) -> list[tuple[str, Camera]]:
+    """Return named cameras in the scene's coordinates; the names are safe for files and all different.
+
+    Args:
+        run: From load_run, train or load_splats.
+        cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
+        camera: Only this camera of a file.
+        count: Views of an orbit or interpolation.
+        size: Width and height in pixels, or "1920x1080", instead of the cameras' own.
+        transform: From the scene's coordinates to those of camera files that other programs write (OpenUSD, .chan); by
+            default that to upright coordinates.
+        up: As in world_transform, for an orbit.
+
+    Raises:
+        SehdrError: If there are none, or `cameras` is neither a known name nor a file.
+    """
+    refuse_paths("load_run", run)
+    check_cameras(cameras)
+    text = str(cameras)
+    if camera is not None and text in SPLITS + PATHS:
+        raise SehdrError(f"--camera {camera}: chooses from a file of cameras, which --cameras {text} is not")
+    if text in SPLITS:
+        views = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
+        if not views:
+            others = ", ".join(word for word in SPLITS + PATHS if word != text)
+            raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
+    elif text in PATHS:
+        photos = training_cameras(run)
+        path = default_path(run, count, up) if text == "orbit" else interpolate(photos, count)
+        if text == "interpolate":
+            path = [film_camera(each, photos) for each in path]
+        digits = max(3, len(str(count - 1)))
+        views = [(f"{text}_{index:0{digits}d}", each) for index, each in enumerate(path)]
+    else:
+        views = _from_file(run, Path(cameras), camera, transform)
+    if size is not None:
+        views = [(name, reframe(each, *read_size(size))) for name, each in views]
+    return list(zip(safe_names([name for name, _ in views]), [each for _, each in views], strict=True))
+
+
+def _from_file(
+    run: "RenderableScene", path: Path, camera: str | None, transform: WorldTransform | None
+) -> list[tuple[str, Camera]]:
+    """Return the cameras of a file, or the one with a name, in the scene's coordinates."""
+    file = read_camera_file(path)
+    views, steps = file.cameras, [from_photos(run)]  # Most files are in the photos' coordinates.
+    if file.world_matrix is not None:
+        try:
+            steps.insert(0, WorldTransform.from_matrix(file.world_matrix).inverse())
+        except ValueError as error:
+            raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
+    elif path.suffix.lower() in EXCHANGE_SUFFIXES:
+        steps = [(transform or world_transform(run)).inverse()]
+    elif run.world_matrix is not None and (own := cameras_beside(Path(run.path))) is not None and own.samefile(path):
+        steps = []  # They are in the coordinates of the Gaussians beside.
+    for step in steps:
+        views = [(name, step.camera(each)) for name, each in views]
+    if camera is None:
+        return views
+    # Frames of a moving camera are named as by read_exchange_cameras(): numbers of four characters or more.
+    frames = re.compile(re.escape(camera) + r"_[-\d.]{4,}")
+    chosen = [view for view in views if view[0] == camera] or [view for view in views if frames.fullmatch(view[0])]
+    if not chosen:
+        raise SehdrError(f"{path}: has no camera {camera!r}{did_you_mean(camera, [name for name, _ in views])}")
+    return chosen
+
+
+def check_cameras(cameras: str | Path) -> None:
+    """Raise SehdrError if a choice of cameras is neither a known word nor a file."""
+    words = (*SPLITS, *PATHS)
+    if str(cameras) not in words and not Path(cameras).exists():
+        hint = did_you_mean(str(cameras), words)
+        raise SehdrError(f"cameras {str(cameras)!r} are neither a file nor one of {', '.join(words)}{hint}")
+
+
+def may_move(cameras: str | Path) -> bool:
+    """Return whether a choice of cameras may be one that moves; those of the run and of a COLMAP model are photos."""
+    return str(cameras) in PATHS or (str(cameras) not in SPLITS and not Path(cameras).is_dir())
+
+
+def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
+    """Return width and height in pixels from "1920x1080" or a pair; raise SehdrError for anything else."""
+    try:
+        width, height = (int(side) for side in (size.lower().split("x") if isinstance(size, str) else size))
+    except (ValueError, TypeError):
+        width = height = 0
+    if min(width, height) < 1 or max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
+        raise SehdrError(f"size {size!r} is not usable; write width and height in pixels, such as 1920x1080")
+    return width, height
+
+
+def reframe(camera: Camera, width: int, height: int) -> Camera:
+    """Return a camera of another size with the same vertical field of view and pixel aspect ratio.
+
+    The picture shows more or less at the sides. Raises SehdrError for a panorama that is not twice as wide as high.
+    """
+    if camera.projection == "equirectangular" and width != 2 * height:
+        raise SehdrError(f"size {width}x{height} would distort a panorama; write one twice as wide as high")
+    scale = height / camera.height
+    cx = width / 2 + (camera.cx - camera.width / 2) * scale
+    intrinsics = {"fx": camera.fx * scale, "fy": camera.fy * scale, "cx": cx, "cy": camera.cy * scale}
+    return replace(camera, width=width, height=height, **intrinsics)

@@ -1,0 +1,60 @@
+"""The EXR attributes that all pictures of a render share: exposure, colors, time, and where the scene came from."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+from ..scene import Camera
+from .images.colorspace import color_space
+from .images.exr import exr_header
+from .lighting.unit import luminance_of_one, read_light_unit
+from .world_transform import WorldTransform, stored_matrix
+
+if TYPE_CHECKING:
+    from ..runs.run import RenderableScene
+
+
+@dataclass(frozen=True)
+class PictureHeader:
+    """EXR attributes that all pictures of a render share.
+
+    Attributes:
+        base_time: Seconds at 0 EV.
+        colorspace: Primaries of the EXR files.
+        captured: Local time that the files state as that of the picture.
+        provenance: Text by key.
+        luminance_of_one: cd/m^2 of a radiance of 1; None if it is not known.
+    """
+
+    base_time: float
+    colorspace: str = "rec709"
+    captured: datetime | None = None
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    luminance_of_one: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raise SehdrError for an unknown color space."""
+        color_space(self.colorspace)
+
+    @staticmethod
+    def of(run: "RenderableScene", transform: WorldTransform, colorspace: str) -> "PictureHeader":
+        """Return the header of pictures of a run that are made now; `transform` leads to the files' coordinates."""
+        facts = provenance(run) | {"worldMatrix": json.dumps(stored_matrix(run, transform).tolist())}
+        now = datetime.now().replace(microsecond=0)
+        return PictureHeader(run.base_time, colorspace, now, facts, luminance_of_one(run))
+
+    def attributes(self, view: str, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
+        """Return the EXR attributes of a picture."""
+        values = {**self.provenance, **provenance, "view": view, "baseExposureTime": repr(float(self.base_time))}
+        luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
+        return exr_header(self.colorspace, exposure_time, camera, self.captured, values, luminance)
+
+
+def provenance(run: "RenderableScene") -> dict[str, str]:
+    """Return where a picture came from, as text by key."""
+    unit = read_light_unit(run)
+    values = {"scene": run.scene_name, "iterations": run.iterations, "units": str(unit or "relative radiance")}
+    values["response"] = getattr(run.response, "name", None)
+    return {key: str(value) for key, value in values.items() if value not in (None, "")}
