@@ -44,7 +44,7 @@ class ViewFileOptions:
     """Further parts of the EXR files, such as depth,normals: depth, position, normals, alpha, confidence, clipped, or
     all; the last three need a run with confidence."""
     evs: str | None = None
-    """Brackets in stops from the photos' exposure, such as --evs=-4,-2,0,2,4."""
+    """Brackets in stops from the photos' exposure, the median if they differ, such as --evs=-4,-2,0,2,4."""
     exposures: str | None = None
     """Brackets as seconds (1/125), multiples of the photos' exposure (1/8x) or stops from it (-2ev): 1/125,1/30,1x."""
     multipart: bool = False

@@ -13,6 +13,7 @@ from ..files import atomic_folder, atomic_path
 from ..model.exposure import Items
 from ..progress import track_progress
 from ..scene import Camera
+from ..scene.exposure.times import shutter
 from ..subsets import evenly, first_names
 from .aovs import data_parts, read_aovs
 from .brackets import Brackets, bracket_exposures, remove_earlier
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _FIT_VIEWS, _FIT_SIZE = 4, 160  # Number and longest side of the pictures that a tone map is fitted to
+_SAME_EXPOSURE = 1.1  # Photos whose exposure times differ by less have one exposure
 _LEAST_ALPHA = 0.01  # Mean coverage below which a picture counts as empty: stray Gaussians are nearly everywhere
 # Written only on request, or only for a path of cameras: what an earlier render left of them is removed. Every render
 # replaces hdr/ and preview/.
@@ -79,7 +81,8 @@ def render_views(
         cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
         camera: Only this camera of a file, by its name there; a moving one with all its frames.
         count: Views of an orbit or interpolation.
-        evs: Brackets in stops from the base exposure, such as "-4,-2,0" or [-4, -2, 0]. Set either evs or exposures.
+        evs: Brackets in stops from run.base_time, the photos' median exposure, such as "-4,-2,0" or [-4, -2, 0]. Set
+            either evs or exposures.
         exposures: Brackets in seconds, stops or multiples of the base exposure, such as "1/125, -2ev, 8x".
         multipart: Write one EXR file with all exposures of a view.
         group_by: "view" or "exposure": what one folder of brackets holds.
@@ -126,6 +129,10 @@ def render_views(
             response=run.response,
             group_by=group_by,
         )
+        times = [entry.exposure_time for entry in run.cameras if entry.split == "train"] or [run.base_time]
+        if max(times) > _SAME_EXPOSURE * min(times):
+            text = "0 EV of the brackets is %s, the photos' median exposure; they have %s to %s"
+            log.info(text, *map(shutter, (run.base_time, min(times), max(times))))
     to_display: Callable[[np.ndarray], np.ndarray] | None = None
     if ocio is not None and view is not None:
         to_display = ocio_view(ocio, view, exposure_of_white(run, 1.0))

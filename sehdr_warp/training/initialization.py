@@ -45,8 +45,11 @@ embedded room, 0.15 in place of 0.5 costs 14 dB."""
 
 
 def base_time(scene: Scene) -> float:
-    """Return dt_1, the median exposure time of the training photos, seconds."""
-    return float(np.median([view.exposure_time for view in scene.train_views]))
+    """Return dt_1, the median exposure time of the training photos, seconds; of two in the middle the shorter.
+
+    So it is the exposure of a photo, whose white and middle grey pictures at 0 EV have.
+    """
+    return float(np.quantile([view.exposure_time for view in scene.train_views], 0.5, method="lower"))
 
 
 def response_for_training(scene: Scene, config: Config) -> Response:

@@ -307,3 +307,14 @@ def test_orbit_follows_an_arc_that_goes_up_and_down():
         near = np.argsort(np.abs(angles - np.arctan2(x, -z)))[:2]
         assert heights[near].min() - 0.05 < -y < heights[near].max() + 0.05
         assert distances[near].min() - 0.1 < np.hypot(x, z) < distances[near].max() + 0.1
+
+
+def test_stops_count_from_the_median_exposure_of_photos_that_differ(tmp_path, logged):
+    run = AnalyticRun()
+    render_views(run, tmp_path / "one", evs=(-1, 0))
+    assert not any("0 EV" in line for line in logged)
+    for entry, time in zip(run.cameras, (0.5, 1 / 60, 2.0), strict=False):
+        entry.exposure_time = time
+    render_views(run, tmp_path / "mixed", evs=(-1, 0))
+    expected = "0 EV of the brackets is 0.5 s, the photos' median exposure; they have 1/60 s to 2 s"
+    assert expected in logged
