@@ -2,9 +2,9 @@
 
 `pack_splats` counts the tiles that each Gaussian's ellipse touches (the ellipse, not its bounding box), and a prefix
 sum over the counts gives every Gaussian its range of intersections. There are two ways to lists in depth order, both by
-stable sorts. With many Gaussians, these are sorted by depth, `emit_intersections` fills their ranges in that order, and
-a sort by tile keeps it: the least work for a GPU. With few, `emit_keys` fills the ranges in the Gaussians' own order,
-and one sort by tile and depth follows: the fewest launches. `find_tile_ranges` finds where each tile's list begins and
+stable sorts. With many Gaussians, these are sorted by depth, `emit_by_depth` fills their ranges in that order, and a
+sort by tile keeps it: the least work for a GPU. With few, `emit_by_index` fills the ranges in their own order, and one
+sort by tile and depth follows: the fewest launches. `find_tile_ranges` finds where each tile's list begins and
 ends, and which subtiles of its tile each intersection touches. Backward passes write the gradients of each intersection
 where it was emitted, and `gather_intersections` sums a Gaussian's, which are neighbors there, in a fixed order.
 """
@@ -25,7 +25,7 @@ the radix sort. Depths outside of that range compare equal."""
 
 @cache
 def tile_kernels(dtype) -> SimpleNamespace:
-    """Return pack_splats, key_by_depth, emit_intersections, emit_keys and gather_intersections for a scalar type."""
+    """Return pack_splats, key_by_depth, emit_by_depth, emit_by_index and gather_intersections for a scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     reals, reals2d = wp.array(dtype=real), wp.array2d(dtype=real)
@@ -114,11 +114,11 @@ def tile_kernels(dtype) -> SimpleNamespace:
         keys[i] = key
         indices[i] = i
 
-    def make_emit_kernel(key, by_depth: bool):
-        bits = DEPTH_BITS if by_depth else 0
+    def make_emit_kernel(key, by_index: bool):
+        bits = DEPTH_BITS if by_index else 0
 
         @wp.kernel(module="unique", module_options=options)
-        def emit_intersections(
+        def emit(
             range_start: int,
             order: ints, means_opacities: vec4s, conics_cutoffs: vec4s, extents: vec2s,
             depths: wp.array(dtype=wp.float32),
@@ -131,13 +131,13 @@ def tile_kernels(dtype) -> SimpleNamespace:
             `max_intersections` get tile columns * rows, which does not exist. overflow: [1], whether more were counted
             than there is memory for; or None.
 
-            keys: tiles, of Gaussians in their order, and `depths` is None. If by_depth, of Gaussians by index, and
+            keys: tiles, of Gaussians in their order, and `depths` is None. If by_index, of Gaussians by index, and
             `order` is None: tiles above DEPTH_BITS of the depth, whose bits order as positive numbers do.
             """
             nth = range_start + wp.tid()
             i = nth
             depth = key(0)
-            if wp.static(by_depth):
+            if wp.static(by_index):
                 depth_bits = wp.cast(depths[i], wp.int32) - wp.static(DEPTH_OFFSET)
                 depth = key(wp.clamp(depth_bits, 0, wp.static((1 << DEPTH_BITS) - 1)))
             else:
@@ -172,7 +172,7 @@ def tile_kernels(dtype) -> SimpleNamespace:
                 gaussians[int(unused)] = 0
                 unused += wp.int64(count)
 
-        return emit_intersections
+        return emit
 
     @wp.kernel(module="unique", module_options=options)
     def gather_intersections(
@@ -193,8 +193,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
 
     return SimpleNamespace(
         pack_splats=pack_splats, key_by_depth=key_by_depth, gather_intersections=gather_intersections,
-        emit_intersections=make_emit_kernel(wp.int32, by_depth=False),
-        emit_keys=make_emit_kernel(wp.int64, by_depth=True),
+        emit_by_depth=make_emit_kernel(wp.int32, by_index=False),
+        emit_by_index=make_emit_kernel(wp.int64, by_index=True),
     )
 
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ..kernels.absolute_gradient import absolute_gradient_kernel
 from ..kernels.constants import TILE_SIZE
+from .gradients import sum_by_gaussian
 from .tile_lists import PackedSplats, TileLists
 from .torch_contract import once_differentiable
 from .warp_launch.launching import launch, warp_scalar
@@ -45,7 +46,7 @@ class _Watch(torch.autograd.Function):
         lists, channels = ctx.lists, features.shape[1]
         emit_order = lists.emit_order
         # On the CPU each intersection has gradients, and whole tiles go to a thread: sums keep one order.
-        emit_indices = lists.gaussians if emit_order is None else emit_order.emit_indices
+        emit_indices = lists.gaussians if emit_order is None else lists.emit_indices
         gradients = features.new_zeros(len(features) if emit_order is None else len(emit_indices), 2)
         tiles, threshold = lists.grid.tiles, ctx.alpha_threshold
         inputs = lists.tile_ranges, lists.gaussians, emit_indices, means_opacities, conics_cutoffs, features
@@ -54,5 +55,5 @@ class _Watch(torch.autograd.Function):
         arguments = *inputs, *sizes, threshold, *upstream, gradients
         kernel = absolute_gradient_kernel(warp_scalar(features.dtype))
         launch(kernel, tiles * _PIXELS, *arguments, ranges=even_ranges(tiles, 1) * _PIXELS)
-        ctx.store(gradients if emit_order is None else emit_order.sum_by_gaussian(gradients))
+        ctx.store(gradients if emit_order is None else sum_by_gaussian(gradients, *emit_order))
         return grad_image, grad_transmittance, None, None, None, None, None

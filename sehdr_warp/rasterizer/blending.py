@@ -3,7 +3,7 @@
 blend() calls the backend of its device, blend_on_cpu() or blend_on_cuda(), which fills the image and returns its
 backward pass. Called with the gradients with respect to image and transmittance (None for 0), that returns the
 gradients by Gaussian, [N, C + 6 or more]: features, conic a b c, x, y, opacity, and columns that pad a row.
-with_gradient() makes this a node of the autograd graph.
+with_gradient() makes this a node of the autograd graph, whose inputs are in the order of these columns.
 """
 
 import math
@@ -17,6 +17,7 @@ from ..kernels import blend_cpu
 from ..kernels.constants import TILE_SIZE
 from ..parallel import thread_count
 from .block_blending import blend_on_cuda
+from .gradients import sum_by_gaussian
 from .projection import Splats
 from .tile_lists import PackedSplats, TileLists
 from .torch_contract import direct_apply, keeps_graph, once_differentiable
@@ -56,36 +57,33 @@ def blend(
     features, channels = splats.features, splats.features.shape[1]
     image = features.new_empty(lists.height, lists.width, channels)
     transmittance = features.new_empty(image.shape[:2])
-    backend = blend_on_cuda if features.device.type == "cuda" else blend_on_cpu
     # Detached: the autograd node owns the backward function, which must not refer to the node's own results.
-    outputs = image.detach(), transmittance.detach()
-    gradients_by_gaussian = backend(features.detach(), lists, packed, *outputs, alpha_threshold, deterministic)
+    arguments = features.detach(), lists, packed, image.detach(), transmittance.detach(), alpha_threshold
+    on_gpu = features.device.type == "cuda"
+    gradients_by_gaussian = blend_on_cuda(*arguments, deterministic) if on_gpu else blend_on_cpu(*arguments)
 
     def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
         gradients = gradients_by_gaussian(grad_image, grad_transmittance)
-        sizes = channels, 3, 2, gradients.shape[1] - channels - 5
-        grad_features, grad_conics, grad_means2d, opacity_and_padding = gradients.split_with_sizes(sizes, 1)
-        return grad_means2d, grad_features, grad_conics, opacity_and_padding.select(1, 0)
+        *others, opacity_and_padding = gradients.tensor_split((channels, channels + 3, channels + 5), 1)
+        return *others, opacity_and_padding.select(1, 0)
 
     result = BlendResult(image, transmittance, backward)
-    return with_gradient(result, splats.means2d, features, splats.conics, splats.opacities)
+    return with_gradient(result, features, splats.conics, splats.means2d, splats.opacities)
 
 
-def with_gradient(
-    result: BlendResult, means2d: Tensor, features: Tensor, *others: Tensor | None
-) -> tuple[Tensor, Tensor]:
+def with_gradient(result: BlendResult, features: Tensor, *others: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return a result's image and transmittance as differentiable functions of what they were blended from.
 
-    others: the tensors whose gradients the result's backward pass returns after those of means2d and features.
+    features, others: the tensors whose gradients the result's backward pass returns, in its order.
     """
     if not torch.is_grad_enabled():
         return result.image, result.transmittance
-    return _apply_blend(result, means2d, features, *others)
+    return _apply_blend(result, features, *others)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, result: BlendResult, means2d, features, *others):
+    def forward(ctx, result: BlendResult, features, *others):
         ctx.sizes, ctx.gradients_of = result.image.shape, result.backward
         # The backward pass reads them: torch then raises its own error if one is changed in place before.
         ctx.save_for_backward(features, result.transmittance)
@@ -123,9 +121,8 @@ def blend_on_cpu(
     image: Tensor,
     transmittance: Tensor,
     alpha_threshold: float,
-    deterministic: bool,
 ) -> Callable[[Tensor, Tensor | None], Tensor]:
-    """Fill image [H, W, C] and transmittance [H, W] by tiles; sums have a fixed order, deterministic or not."""
+    """Fill image [H, W, C] and transmittance [H, W] by tiles; sums have a fixed order."""
     emit_order, tiles, channels = lists.emit_order, lists.grid.tiles, features.shape[1]
     assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
     highest = float(packed.means_opacities[:, 2].max()) if len(features) else 0.0
@@ -153,10 +150,10 @@ def blend_on_cpu(
         gradients = last_contributor, grad_image.view(-1, channels), grad_transmittance, to_front
         by_pixel = scratch(ROWS_OF_TILE), scratch(channels, ROWS_OF_TILE)
         by_row = scratch(TILE_SIZE), scratch(TILE_SIZE), scratch(channels + 6)
-        inputs = lists.tile_ranges, lists.gaussians, emit_order.emit_indices, *shared
+        inputs = lists.tile_ranges, lists.gaussians, lists.emit_indices, *shared
         arguments = *inputs, *gradients, *by_pixel, *by_row, grad_intersections
         launch(blend_cpu.backward_kernel(scalar, channels, squarings), tiles, *arguments, ranges=ranges)
-        return emit_order.sum_by_gaussian(grad_intersections)
+        return sum_by_gaussian(grad_intersections, *emit_order)
 
     return backward
 

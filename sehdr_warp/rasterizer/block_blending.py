@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..kernels import blend_cuda, blend_cuda_backward
+from .gradients import sum_by_gaussian
 from .tile_lists import MAX_SINGLE_SORT, PackedSplats, TileLists
 from .warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar
 
@@ -73,8 +74,8 @@ class BlockBackward:
         emit_order, arguments = lists.emit_order, self._arguments(grad_image, grad_transmittance)
         assert emit_order is not None, "sums in a fixed order need the intersections as they were emitted"
         for subtile in range(blend_cuda.BLOCKS_PER_TILE):
-            launch_blocks(self._kernel(), lists, 1, *arguments, subtile, emit_order.emit_indices, grad_intersections)
-        return emit_order.sum_by_gaussian(grad_intersections)
+            launch_blocks(self._kernel(), lists, 1, *arguments, subtile, lists.emit_indices, grad_intersections)
+        return sum_by_gaussian(grad_intersections, *emit_order)
 
     def on_fixed_memory(self) -> "FixedBackward":
         """Return the backward pass for less host time; for use while all tensors stay where they are.

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, NEAR_PLANE
 from .losses.ssim import ssim, ssim_map
 from .ops.harmonics import check_harmonics, spherical_harmonics
-from .projection import RasterTensors
+from .projection import GaussiansAndCamera
 from .rasterization import Rendering, check_shapes, rasterize
 from .render_options import RenderOptions
 from .sphere import rasterize_directions
@@ -98,7 +98,7 @@ def _run_rasterize(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
 
 
 def _fake_rasterize(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
-    check_shapes(RasterTensors(*tensors[:7]), tensors[7] if len(tensors) > 7 else None)
+    check_shapes(GaussiansAndCamera(*tensors[:7]), tensors[7] if len(tensors) > 7 else None)
     options = RenderOptions(*values)
     height, width = options.height, options.width
     means, features, pose = tensors[0], tensors[4], tensors[5]

@@ -1,4 +1,4 @@
-"""Memory and layout of gradients, and scalars that cost no launch."""
+"""Memory, layout and sums of gradients, and scalars that cost no launch."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
+from ..kernels.tiles import tile_kernels
+from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import torch_threads
 
 
@@ -41,6 +43,21 @@ def _zeros_together(tensors: list[Tensor]) -> list[Tensor]:
     lengths = [-(-tensor.numel() // 64) * 64 for tensor in tensors]
     zeros, starts = tensors[0].new_zeros(sum(lengths)), accumulate(lengths, initial=0)
     return [zeros.as_strided(t.shape, t.stride(), start) for t, start in zip(tensors, starts, strict=False)]
+
+
+def sum_by_gaussian(grad_intersections: Tensor, order: Tensor | None, cumulative_counts: Tensor) -> Tensor:
+    """Return [N, columns]: the sum over the intersections of each Gaussian, in the order of tiles.
+
+    grad_intersections: [M, columns] at TileLists.emit_indices. order, cumulative_counts: of TileLists.emit_order.
+    """
+    assert order is not None, "intersections of one Gaussian are not neighbors"
+    length, columns = grad_intersections.shape
+    sums = grad_intersections.new_zeros(len(order), columns)
+    if length:
+        cumulative_counts = cumulative_counts.clamp(0, length)  # Nothing is beyond max_intersections.
+        kernel = tile_kernels(warp_scalar(sums.dtype)).gather_intersections
+        launch(kernel, len(order), order, cumulative_counts, grad_intersections, columns, sums)
+    return sums
 
 
 def kernel_layout(gradient: Tensor) -> Tensor:

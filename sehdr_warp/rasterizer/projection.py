@@ -19,7 +19,7 @@ from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import single_range
 
 
-class RasterTensors(NamedTuple):
+class GaussiansAndCamera(NamedTuple):
     """The tensors that rasterize() takes, for one camera."""
 
     means: Tensor
@@ -31,7 +31,7 @@ class RasterTensors(NamedTuple):
     intrinsics: Tensor
 
     @property
-    def of_projection(self) -> tuple[Tensor, ...]:
+    def without_features(self) -> tuple[Tensor, ...]:
         """Return what project_to_camera() takes, in its order: all but the features."""
         return *self[:4], *self[5:]
 

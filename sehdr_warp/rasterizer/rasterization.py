@@ -1,12 +1,10 @@
 """Differentiable rasterization of 3D Gaussians: project, order, list by tile, blend.
 
 A call, from top to bottom: rasterize() checks its arguments. _begin_view() projects the Gaussians to a camera
-(projection.py); they are called splats then. _finish_view() goes on with render_projected(), which packs the
-splats, orders them by depth, lists them by tile (tile_lists.py), and blends the lists (blending.py).
+(projection.py); they are called splats then. render_projected() packs the splats, orders them by depth, lists them by
+tile (tile_lists.py), and blends the lists (blending.py).
 
-On a GPU, a call like earlier ones is replayed as a CUDA graph instead: _begin_view() then renders all of it, and
-_finish_view() waits for the number of intersections, which tells whether the graph's memory was enough. These are two
-functions so that the GPU renders all cameras of a call while the host waits for the first one.
+On a GPU, a call like earlier ones is replayed as a CUDA graph instead (_begin_replay() and cuda_graphs/).
 """
 
 from collections.abc import Callable
@@ -21,9 +19,9 @@ from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
 from .checks import check_cameras, check_opacities, check_tensors
-from .cuda_graphs.cache import GraphPool, ReplayedRender, find_pool, get_or_create_pool
+from .cuda_graphs.cache import GraphInUse, GraphPool, checked_pool, pool_for
 from .memory import oom_context
-from .projection import ProjectedGaussians, RasterTensors, Splats, project_to_camera
+from .projection import GaussiansAndCamera, ProjectedGaussians, Splats, project_to_camera
 from .render_options import RenderOptions
 from .tile_lists import build_tile_lists, order_intersections, pack_splats
 from .torch_contract import torch_operation
@@ -81,7 +79,7 @@ class Rendering:
         return self.radii > 0
 
 
-@partial(torch_operation, compiles=True)
+@partial(torch_operation, compiles=True)  # Within torch.compile custom_ops.compiled_rasterize() takes its place.
 def rasterize(
     means: Tensor,
     log_scales: Tensor,
@@ -149,9 +147,8 @@ def rasterize(
     options = RenderOptions(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
-    tensors = RasterTensors(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
-    # The CUDA graphs of calls like this one, whose arguments were checked at the first of them; None on the CPU.
-    pool = find_pool(tensors, options)
+    tensors = GaussiansAndCamera(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
+    pool = checked_pool(tensors, options)  # CUDA graphs of calls like this one, which were checked; None on the CPU.
     if pool is None or background is not None:
         check_shapes(tensors, background)
         check_opacities(opacities)
@@ -159,8 +156,8 @@ def rasterize(
         options = options.checked(means.device)
     try:
         if world_to_camera.ndim == 2:
-            view = _begin_view(tensors, options, pool or get_or_create_pool(tensors, options))
-            rendering = _finish_view(view, view.means2d, tensors, options)
+            means2d, finish = _begin_view(tensors, options, pool or pool_for(tensors, options))
+            rendering = finish(means2d)
         else:
             rendering = _render_cameras(tensors, options)
         if background is not None:
@@ -174,7 +171,7 @@ def rasterize(
             raise
 
 
-def check_shapes(tensors: RasterTensors, background: Any) -> None:
+def check_shapes(tensors: GaussiansAndCamera, background: Any) -> None:
     """Raise what rasterize() does for tensors whose shapes, dtypes or devices do not fit."""
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
 
@@ -202,36 +199,41 @@ def check_shapes(tensors: RasterTensors, background: Any) -> None:
 
 
 def _begin_view(
-    tensors: RasterTensors, options: RenderOptions, pool: GraphPool | None
-) -> ProjectedGaussians | ReplayedRender:
-    """Project to one camera; on a GPU, replay a CUDA graph that renders the image as well if the pool has one.
+    tensors: GaussiansAndCamera, options: RenderOptions, pool: GraphPool | None
+) -> tuple[Tensor, Callable[[Tensor], Rendering]]:
+    """Project to one camera; return means2d [N, 2], and what renders from them or, of several cameras, from a part.
 
-    pool: CUDA graphs of calls like this one (cuda_graphs/cache.py); None if it is to be launched.
+    pool: CUDA graphs of calls like this one; None if it is to be launched.
     """
     graph = None if pool is None else pool.begin_render(tensors, options)
-    return project_to_camera(*tensors.of_projection, options=options) if graph is None else graph.render(tensors)
-
-
-def _finish_view(
-    view: ProjectedGaussians | ReplayedRender, means2d: Tensor, tensors: RasterTensors, options: RenderOptions
-) -> Rendering:
-    """Return the rendering of a view that _begin_view() began for these tensors, as a function of means2d [N, 2].
-
-    means2d: those of `view`; of several cameras a part of one tensor, whose gradient then holds all of theirs.
-    """
+    if graph is not None:
+        return _begin_replay(graph, tensors, options)
+    projected = project_to_camera(*tensors.without_features, options=options)
     features = tensors.features
-    if isinstance(view, ReplayedRender):
+    return projected.means2d, lambda means2d: render_projected(projected._replace(means2d=means2d), features, options)
+
+
+def _begin_replay(
+    graph: GraphInUse, tensors: GaussiansAndCamera, options: RenderOptions
+) -> tuple[Tensor, Callable[[Tensor], Rendering]]:
+    """Do what _begin_view() does, but let a CUDA graph render all of it: also while the host waits in finish()."""
+    blended, means2d, depths, extents, conics_opacities = graph.render(tensors)
+
+    def finish(means2d: Tensor) -> Rendering:
+        features = tensors.features
         if options.depth and torch.is_grad_enabled():  # The image has its depths; their gradient must go on to them.
-            features = torch.cat([features, view.depths[:, None]], 1)
-        image, transmittance = with_gradient(view.blended, means2d, features, view.conics_opacities)
-        count = view.graph.count_intersections()  # Called last, because it waits for the GPU.
-        if count is not None:
-            return _rendering(options, image, transmittance, means2d, view.depths, view.extents, count)
-        view = project_to_camera(*tensors.of_projection, options=options)
-    return render_projected(view._replace(means2d=means2d), tensors.features, options, replays=False)
+            features = torch.cat([features, depths[:, None]], 1)
+        image, transmittance = with_gradient(blended, features, means2d, conics_opacities)
+        count = graph.count_intersections()  # Called last, because it waits for the GPU.
+        if count is None:  # The graph has too little memory.
+            projected = project_to_camera(*tensors.without_features, options=options)
+            return render_projected(projected._replace(means2d=means2d), tensors.features, options)
+        return _rendering(options, image, transmittance, means2d, depths, extents, count)
+
+    return means2d, finish
 
 
-def _render_cameras(tensors: RasterTensors, options: RenderOptions) -> Rendering:
+def _render_cameras(tensors: GaussiansAndCamera, options: RenderOptions) -> Rendering:
     """Render to several cameras; opacities and features may have an axis of cameras too."""
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
     count = len(world_to_camera)
@@ -242,58 +244,60 @@ def _render_cameras(tensors: RasterTensors, options: RenderOptions) -> Rendering
         intrinsics,
         strict=True,
     )
-    calls = [RasterTensors(means, log_scales, quaternions, *each) for each in of_cameras]
-    views = [_begin_view(call, options, get_or_create_pool(call, options)) for call in calls]
+    calls = [GaussiansAndCamera(means, log_scales, quaternions, *each) for each in of_cameras]
+    centers, finishes = zip(*(_begin_view(call, options, pool_for(call, options)) for call in calls), strict=True)
     # One tensor that every image is rendered from, so that its gradient holds every camera's.
-    means2d = torch.stack([view.means2d for view in views])
-    renderings = [_finish_view(*each, options) for each in zip(views, means2d, calls, strict=True)]
-    return join_renderings(means2d, renderings)
+    means2d = torch.stack(centers)
+    return join_renderings(means2d, [finish(part) for finish, part in zip(finishes, means2d, strict=True)])
+
+
+def replay_projected(projected: ProjectedGaussians, features: Tensor, options: RenderOptions) -> Rendering | None:
+    """Do what render_projected() does by a CUDA graph, of calls like it; None if there is none, as on the CPU."""
+    splats = _to_splats(projected, features, options)
+    pool = pool_for(splats, options) if splats.extents.is_contiguous() else None
+    graph = None if pool is None else pool.begin_render(splats, options)
+    if graph is None:
+        return None
+    means2d, conics, depths, opacities, extents = projected
+    image, transmittance = with_gradient(graph.render_projected(splats), splats.features, conics, means2d, opacities)
+    count = graph.count_intersections()
+    return None if count is None else _rendering(options, image, transmittance, means2d, depths, extents, count)
 
 
 def render_projected(
     projected: ProjectedGaussians,
     features: Tensor,
     options: RenderOptions,
-    *,
-    replays: bool = True,
     store_absolute: Callable[[Tensor], None] | None = None,
 ) -> Rendering:
     """Render 2D Gaussians of one camera with features [N, C].
 
     Sets the extents of Gaussians whose features are not finite to 0, in place.
 
-    replays: on a GPU, replay calls that repeat as CUDA graphs. Not for rasterize(), which replays projections, too.
-    store_absolute: of watch_absolute_gradients(), for compat.gsplat. Such calls are always launched.
+    store_absolute: of watch_absolute_gradients(), for compat.gsplat.
     """
-    means2d, conics, depths, opacities, extents = projected
-    if options.depth:
-        features = torch.cat([features, depths[:, None]], 1)
-    features = features.contiguous()
-    # extents.data: pack_splats() writes to it in place, which torch's check of saved tensors must not see.
-    splats = Splats(means2d, conics, depths, opacities, extents.data, features)
-    if replays and store_absolute is None and extents.is_contiguous():
-        pool = get_or_create_pool(splats, options)
-        graph = None if pool is None else pool.begin_render(splats, options)
-        if graph is not None:
-            blended = graph.render_projected(splats)
-            image, transmittance = with_gradient(blended, means2d, features, conics, opacities)
-            count = graph.count_intersections()
-            if count is not None:
-                return _rendering(options, image, transmittance, means2d, depths, extents, count)
-    width, height = options.width, options.height
-    packed = pack_splats(splats, options.alpha_threshold, width, height)
+    splats = _to_splats(projected, features, options)
+    width, height, threshold = options.width, options.height, options.alpha_threshold
+    packed = pack_splats(splats, threshold, width, height)
     # Sums of gradients in a fixed order need it, atomics of a GPU do not.
     keep_emit_order = features.device.type == "cpu" or options.deterministic
-    offsets = order_intersections(packed, keep_emit_order=keep_emit_order)
-    lists = build_tile_lists(packed, offsets, width, height, options.max_intersections)
-    image, transmittance = blend(splats, lists, packed, options.alpha_threshold, options.deterministic)
+    order = order_intersections(packed, keep_emit_order=keep_emit_order)
+    lists = build_tile_lists(packed, order, width, height, options.max_intersections, keep_emit_order=keep_emit_order)
+    image, transmittance = blend(splats, lists, packed, threshold, options.deterministic)
     if store_absolute is not None:
         image, transmittance = watch_absolute_gradients(
-            image, transmittance, features, lists, packed, options.alpha_threshold, store_absolute
+            image, transmittance, splats.features, lists, packed, threshold, store_absolute
         )
     needed = None if options.max_intersections is None else lists.total
-    results = image, transmittance, means2d, depths, extents
+    results = image, transmittance, projected.means2d, projected.depths, projected.extents
     return _rendering(options, *results, lists.intersection_count, lists.overflow, needed)
+
+
+def _to_splats(projected: ProjectedGaussians, features: Tensor, options: RenderOptions) -> Splats:
+    if options.depth:
+        features = torch.cat([features, projected.depths[:, None]], 1)
+    # extents.data: pack_splats() writes to it in place, which torch's check of saved tensors must not see.
+    return Splats(*projected[:4], projected.extents.data, features.contiguous())
 
 
 def _rendering(options: RenderOptions, image: Tensor, *others: Any) -> Rendering:

@@ -19,6 +19,7 @@ from .checks import (
     is_positive,
     real,
 )
+from .gradients import sum_by_gaussian
 from .memory import oom_context
 from .projection import launch_projection
 from .tile_lists import EmitOrder, TileLists, check_intersection_count, depth_order, lists_by_tile, tile_grid
@@ -138,8 +139,8 @@ def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_o
     tiles, gaussians = (torch.empty(2 * length, dtype=torch.int32, device=order.device) for _ in range(2))
     launch(kernel, count * bool(length), *shared, starts, counts, tiles, gaussians, min_range=256)
     tile_ranges, gaussians, _, emit_indices = lists_by_tile(tiles, gaussians, length, None, grid, keep_emit_order)
-    emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
-    return TileLists(tile_ranges, gaussians, None, emit_order, width, height, None, total.clone())
+    emit_order = EmitOrder(order.clone(), cumulative_counts) if keep_emit_order else None
+    return TileLists(tile_ranges, gaussians, None, emit_order, emit_indices, width, height, None, total.clone())
 
 
 class _Blend(torch.autograd.Function):
@@ -164,14 +165,14 @@ class _Blend(torch.autograd.Function):
         *splats, transmittance, ends = ctx.saved_tensors
         lists, emit_order, (count, channels) = ctx.lists, ctx.lists.emit_order, splats[-1].shape
         # On the CPU each intersection has gradients, and whole tiles go to a thread: sums keep one order.
-        emit_indices = lists.gaussians if emit_order is None else emit_order.emit_indices
+        emit_indices = lists.gaussians if emit_order is None else lists.emit_indices
         gradients = grad_image.new_zeros(count if emit_order is None else len(emit_indices), channels + 10)
         upstream = grad_image.contiguous().view(-1, channels), grad_transmittance.contiguous()
         arguments = *ctx.inputs, *splats, *ctx.sizes, transmittance, ends, emit_indices, *upstream, gradients
         ranges = even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS
         launch(ctx.kernels.blend_backward, ctx.pixels, *arguments, ranges=ranges)
         if emit_order is not None:
-            gradients = emit_order.sum_by_gaussian(gradients)
+            gradients = sum_by_gaussian(gradients, *emit_order)
         grad_axis, grad_across, grad_along, grad_opacity, grad_features = gradients.split((3, 3, 3, 1, channels), dim=1)
         grad_caps = torch.nn.functional.pad(grad_axis, (0, 1))
         return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None, None

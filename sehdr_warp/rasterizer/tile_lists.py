@@ -65,39 +65,17 @@ def tile_grid(width: int, height: int) -> TileGrid:
     return TileGrid(-(-width // TILE_SIZE), -(-height // TILE_SIZE))
 
 
-class IntersectionOffsets(NamedTuple):
-    """The order in which Gaussians emit intersections, and where each one's end.
+class EmitOrder(NamedTuple):
+    """The order in which Gaussians emit intersections, those of one Gaussian as neighbors, and where each one's end.
 
-    order: [N] int32 Gaussians by depth; None for the order of their indices, after which the sort by tile also sorts by
-    depth.
+    Attributes:
+        order: [N] int32 Gaussians by depth, nearest first (ties by index; culled ones last); None for the order of
+            their indices, after which the sort by tile also sorts by depth.
+        cumulative_counts: [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order.
     """
 
     order: Tensor | None
-    cumulative_counts: Tensor  # [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order
-    keep_emit_order: bool  # Whether the lists get TileLists.emit_order
-
-
-@dataclass(frozen=True)
-class EmitOrder:
-    """The order of intersections before the sort by tile, in which those of one Gaussian are neighbors."""
-
-    order: Tensor  # [N] int32 Gaussians by depth, nearest first (ties by index; culled ones last)
-    cumulative_counts: Tensor  # [N] int64 inclusive prefix sum of the Gaussians' intersection counts, in that order
-    emit_indices: Tensor  # [M] int32 index of each sorted intersection before the sort
-
-    def sum_by_gaussian(self, grad_intersections: Tensor) -> Tensor:
-        """Return [N, columns]: the sum over the intersections of each Gaussian, in the order of tiles.
-
-        grad_intersections: [M, columns], in the order before the sort by tile.
-        """
-        length, columns = grad_intersections.shape
-        count = len(self.order)
-        sums = grad_intersections.new_zeros(count, columns)
-        if length:
-            cumulative_counts = self.cumulative_counts.clamp(0, length)  # Nothing is beyond max_intersections.
-            kernel = kernels.tile_kernels(warp_scalar(sums.dtype)).gather_intersections
-            launch(kernel, count, self.order, cumulative_counts, grad_intersections, columns, sums)
-        return sums
+    cumulative_counts: Tensor
 
 
 @dataclass(frozen=True)
@@ -109,7 +87,8 @@ class TileLists:
         gaussians: [M] the Gaussian of each intersection.
         subtile_masks: [M] uint8, bit k set if the ellipse touches subtile k of its tile; None where no block kernel
             reads them: from the CPU's sort by counting, and for rasterize_directions().
-        emit_order: of the intersections before the sort; None unless it was to be kept.
+        emit_order: of the intersections before the sort; None unless it was to be kept, for sum_by_gaussian().
+        emit_indices: [M] index of each intersection in that order; None without it.
         width: of the image in pixels.
         height: of the image in pixels.
         overflow: scalar bool, whether max_intersections was too few; None without it.
@@ -120,6 +99,7 @@ class TileLists:
     gaussians: Tensor
     subtile_masks: Tensor | None
     emit_order: EmitOrder | None
+    emit_indices: Tensor | None
     width: int
     height: int
     overflow: Tensor | None
@@ -183,54 +163,60 @@ def _pack_arguments(
 
 
 @torch.no_grad()
-def order_intersections(packed: PackedSplats, *, keep_emit_order: bool = True) -> IntersectionOffsets:
-    """Return the order in which Gaussians emit intersections, by depth, and the running number of these.
+def order_intersections(packed: PackedSplats, *, keep_emit_order: bool = True) -> EmitOrder:
+    """Return the order in which Gaussians emit intersections: by depth.
 
-    If the order need not be kept, a sort of few Gaussians is spared: that of their intersections then sorts by depth.
-
-    keep_emit_order: let build_tile_lists() return TileLists.emit_order, which backward passes need to sum by Gaussian
-        in a fixed order.
+    keep_emit_order: of build_tile_lists(). Without it a sort of few Gaussians is spared, because that of their
+        intersections also sorts by depth.
     """
     counts, depths = packed.counts, packed.depths
     if len(depths) <= MAX_SINGLE_SORT and not keep_emit_order and depths.dtype == torch.float32:
-        return IntersectionOffsets(None, counts.cumsum(0), keep_emit_order)
+        return EmitOrder(None, counts.cumsum(0))
     order = depth_order(depths, packed.extents)
     with torch_threads(counts.device):
         counts = counts[order]
-    return IntersectionOffsets(order, counts.cumsum(0), keep_emit_order)
+    return EmitOrder(order, counts.cumsum(0))
 
 
 @torch.no_grad()
 def build_tile_lists(
-    packed: PackedSplats, offsets: IntersectionOffsets, width: int, height: int, max_intersections: int | None = None
+    packed: PackedSplats,
+    emit_order: EmitOrder,
+    width: int,
+    height: int,
+    max_intersections: int | None = None,
+    *,
+    keep_emit_order: bool = False,
 ) -> TileLists:
     """List for each tile of an image the Gaussians whose ellipse touches it, nearest first.
 
     max_intersections: allocate memory for this many; those beyond it are left out, see TileLists.overflow. The host
         then does not wait for the device to learn how many there are.
+    keep_emit_order: return TileLists.emit_order, which must be by depth.
 
     Raises SehdrError if there are more than MAX_INTERSECTIONS.
     """
     grid, count = tile_grid(width, height), len(packed.depths)
-    order, cumulative_counts, keep_emit_order = offsets
+    order, cumulative_counts = emit_order
     total = cumulative_counts[-1] if count else cumulative_counts.new_zeros(())
     overflow = None
     if max_intersections is not None:  # Written by the kernel that emits, if it is launched, which saves a launch.
         overflow = (torch.empty if count else torch.zeros)((), dtype=torch.bool, device=cumulative_counts.device)
     length = int(total) if max_intersections is None else max_intersections
     check_intersection_count(length, count, grid)
-    keys, gaussians = emit_intersections(packed, offsets, grid, length, overflow)
+    keys, gaussians = emit_intersections(packed, emit_order, grid, length, overflow)
     if order is None:
         sort_pairs(keys, gaussians, length, kernels.DEPTH_BITS + grid.tiles.bit_length())
         gaussians = gaussians[:length]
         tile_ranges, subtile_masks = find_tile_ranges(keys[:length], gaussians, packed, grid)
-        return TileLists(tile_ranges, gaussians, subtile_masks, None, width, height, overflow, total)
+        return TileLists(tile_ranges, gaussians, subtile_masks, None, None, width, height, overflow, total)
     tile_ranges, gaussians, subtile_masks, emit_indices = lists_by_tile(
         keys, gaussians, length, packed, grid, keep_emit_order
     )
     # Copies, because order and total are views that would keep larger buffers.
-    emit_order = None if emit_indices is None else EmitOrder(order.clone(), cumulative_counts, emit_indices)
-    return TileLists(tile_ranges, gaussians, subtile_masks, emit_order, width, height, overflow, total.clone())
+    kept = EmitOrder(order.clone(), cumulative_counts) if keep_emit_order else None
+    lists = tile_ranges, gaussians, subtile_masks, kept, emit_indices
+    return TileLists(*lists, width, height, overflow, total.clone())
 
 
 def depth_order(depths: Tensor, extents: Tensor) -> Tensor:
@@ -256,17 +242,17 @@ def check_intersection_count(length: int, count: int, grid: TileGrid) -> None:
 
 
 def emit_intersections(
-    packed: PackedSplats, offsets: IntersectionOffsets, grid: TileGrid, length: int, overflow: Tensor | None = None
+    packed: PackedSplats, emit_order: EmitOrder, grid: TileGrid, length: int, overflow: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return sort keys and Gaussians of all intersections.
 
-    If the offsets have an order, the keys are int32 tiles, and intersections follow that order. Otherwise the keys are
+    If Gaussians emit by depth, the keys are int32 tiles, and intersections follow that order. Otherwise the keys are
     int64, the tile above the bits of the depth, and intersections follow the Gaussians' indices.
 
     Both are [2 * length], of which the first half is filled; the sort needs the rest. Unused intersections belong to
     tile grid.tiles. Writes to overflow, a scalar bool, whether there are more than `length`.
     """
-    order, cumulative_counts, _ = offsets
+    order, cumulative_counts = emit_order
     count, device = len(packed.depths), packed.depths.device
     keys = torch.empty(2 * length, dtype=torch.int64 if order is None else torch.int32, device=device)
     gaussians = torch.empty(2 * length, dtype=torch.int32, device=device)
@@ -274,14 +260,14 @@ def emit_intersections(
         keys[:length], gaussians[:length] = grid.tiles << (kernels.DEPTH_BITS if order is None else 0), 0
     elif length:
         emit = kernels.tile_kernels(warp_scalar(packed.means_opacities.dtype))
-        kernel, depths = (emit.emit_keys, packed.depths) if order is None else (emit.emit_intersections, None)
+        kernel, depths = (emit.emit_by_index, packed.depths) if order is None else (emit.emit_by_depth, None)
         inputs = order, packed.means_opacities, packed.conics_cutoffs, packed.extents, depths, *grid
         launch(kernel, count, *inputs, cumulative_counts, length, keys, gaussians, overflow)
     return keys, gaussians
 
 
 class SortedIntersections(NamedTuple):
-    """Intersections by tile: tile_ranges, gaussians and subtile_masks of TileLists, and emit_indices of EmitOrder."""
+    """Intersections by tile, as TileLists has them."""
 
     tile_ranges: Tensor
     gaussians: Tensor

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from sehdr_warp.rasterizer import tile_lists
-from sehdr_warp.rasterizer.cuda_graphs import cache, captured_render
+from sehdr_warp.rasterizer.cuda_graphs import cache, render_graph
 from sehdr_warp.rasterizer.warp_launch import packing
 
 
@@ -45,7 +45,7 @@ def tensors_of(value) -> Iterator[torch.Tensor]:
 def emulate(monkeypatch) -> None:
     """Let calls on the CPU be replayed, with block kernels emulated; ordinary kernels must not run in blocks."""
     empty = torch.empty
-    monkeypatch.setattr(captured_render, "CudaGraphRunner", Runner)
+    monkeypatch.setattr(render_graph, "CudaGraphRunner", Runner)
     monkeypatch.setattr(cache, "on_gpu", lambda tensor: True)
     monkeypatch.setattr(cache, "stream_handle", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device=None: None)

@@ -1,5 +1,6 @@
 """The CUDA block kernels run in Warp's CPU block emulation, so that a machine without a GPU tests their logic."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -24,7 +25,7 @@ BOUNDS = {torch.float64: 1e-12, torch.float32: 1e-5}
 @pytest.fixture
 def blocks(monkeypatch):
     """Switches block kernels on the CPU on; off again, because ordinary kernels must not run in blocks."""
-    monkeypatch.setattr(blending, "blend_on_cpu", blend_on_cuda)
+    monkeypatch.setattr(blending, "blend_on_cpu", partial(blend_on_cuda, deterministic=False))
     monkeypatch.setattr(tile_lists, "lists_by_tile", tile_lists._sort_by_tile)
 
     def run(task):
@@ -40,7 +41,8 @@ def blocks(monkeypatch):
 def leaves_and_lists(scene):
     """Return arguments of blend(): splats whose tensors are leaves, lists and packed Gaussians."""
     gaussians, splats = projected(scene), packed(scene)
-    lists = build_tile_lists(splats, order_intersections(splats), scene.width, scene.height)
+    order = order_intersections(splats)
+    lists = build_tile_lists(splats, order, scene.width, scene.height, keep_emit_order=True)
     leaves = [tensor.detach().requires_grad_() for tensor in (*gaussians, scene.tensors[4])]
     return Splats(*leaves), lists, splats
 
@@ -55,7 +57,8 @@ def test_more_gradients_than_int32_counts_are_refused_in_a_fixed_order():
 
 @pytest.mark.parametrize("dtype", BOUNDS, ids=["float64", "float32"])
 @pytest.mark.parametrize("channels, deterministic", [(1, False), (3, False), (3, True), (9, False)])
-def test_block_kernels_match_the_reference(blocks, dtype, channels, deterministic):
+def test_block_kernels_match_the_reference(blocks, dtype, channels, deterministic, monkeypatch):
+    monkeypatch.setattr(blending, "blend_on_cpu", partial(blend_on_cuda, deterministic=deterministic))
     # Enough overlap that queues spill over 32 and pixels finish early; a cut tile at the right and the bottom.
     scene = random_scene(count=600, channels=channels, width=44, height=26, spread=1.6, seed=2)
     leaves, lists, splats = leaves_and_lists(scene.to(dtype))

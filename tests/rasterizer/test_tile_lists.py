@@ -1,14 +1,12 @@
 """The lists of the tiles: every counted intersection is written, whatever the two kernels make of a border case."""
 
-from dataclasses import fields
-
 import pytest
 import torch
 
 from sehdr_warp.kernels.tiles import DEPTH_BITS
 from sehdr_warp.rasterizer import tile_lists
 from sehdr_warp.rasterizer.tile_lists import (
-    IntersectionOffsets,
+    EmitOrder,
     PackedSplats,
     TileGrid,
     build_tile_lists,
@@ -19,6 +17,7 @@ from sehdr_warp.rasterizer.tile_lists import (
 )
 from sehdr_warp.rasterizer.warp_launch.launching import sort_pairs
 
+from .emulated_graphs import tensors_of
 from .scenes import packed, random_scene
 
 GRID, UNWRITTEN = TileGrid(columns=20, rows=15), -7
@@ -37,8 +36,10 @@ def counted(*scene):
 
 
 def built(splats, max_intersections=None, *, keep_emit_order=True):
-    offsets = order_intersections(splats, keep_emit_order=keep_emit_order)
-    return build_tile_lists(splats, offsets, 16 * GRID.columns, 16 * GRID.rows, max_intersections)
+    emit_order = order_intersections(splats, keep_emit_order=keep_emit_order)
+    return build_tile_lists(
+        splats, emit_order, 16 * GRID.columns, 16 * GRID.rows, max_intersections, keep_emit_order=keep_emit_order
+    )
 
 
 def emit(order, splats, counts, monkeypatch):
@@ -46,8 +47,8 @@ def emit(order, splats, counts, monkeypatch):
     empty = torch.empty
     monkeypatch.setattr(torch, "empty", lambda *a, **k: empty(*a, **k).fill_(UNWRITTEN))
     capacity = int(counts.sum())
-    offsets = IntersectionOffsets(order, counts.cumsum(0), False)
-    tiles, gaussians = emit_intersections(splats, offsets, GRID, capacity)
+    emit_order = EmitOrder(order, counts.cumsum(0))
+    tiles, gaussians = emit_intersections(splats, emit_order, GRID, capacity)
     monkeypatch.undo()
     return tiles[:capacity], gaussians[:capacity]
 
@@ -88,8 +89,8 @@ def test_one_sort_makes_the_lists_of_two(device, spare):
     splats = splats._replace(depths=(splats.depths * 4).round().clamp_min(1) / 4)
     lists = built(splats)
     capacity = lists.intersection_count + spare
-    offsets = IntersectionOffsets(None, splats.counts.cumsum(0), False)
-    keys, gaussians = emit_intersections(splats, offsets, GRID, capacity)
+    emit_order = EmitOrder(None, splats.counts.cumsum(0))
+    keys, gaussians = emit_intersections(splats, emit_order, GRID, capacity)
     sort_pairs(keys, gaussians, capacity, DEPTH_BITS + GRID.tiles.bit_length())
     keys, gaussians = keys[:capacity], gaussians[:capacity]
     ranges, corners = find_tile_ranges(keys, gaussians, splats, GRID)
@@ -110,8 +111,8 @@ def test_depths_beyond_the_bits_of_the_keys_keep_their_order_up_to_ties(device):
     one = {"counts": torch.ones_like(splats.counts), "extents": torch.full_like(splats.extents, 3.0)}
     splats = splats._replace(depths=depths, **everywhere, **one)
     for keep_emit_order, expected in ((False, [2, 3, 6, 4, 5, 0, 1]), (True, [3, 2, 6, 4, 5, 0, 1])):
-        offsets = order_intersections(splats, keep_emit_order=keep_emit_order)
-        assert build_tile_lists(splats, offsets, 16, 16).gaussians.tolist() == expected
+        emit_order = order_intersections(splats, keep_emit_order=keep_emit_order)
+        assert build_tile_lists(splats, emit_order, 16, 16).gaussians.tolist() == expected
 
 
 def test_subtiles_are_those_that_an_ellipse_touches(device):
@@ -145,14 +146,6 @@ def test_overflow_is_more_intersections_than_capacity(device, keep_emit_order, c
         assert bool(lists.overflow) == (intersections > capacity) and lists.total == intersections
 
 
-def kept_bytes(holder):
-    """Of the memory behind a dataclass's tensors, and of the dataclasses in it."""
-    values = [getattr(holder, field.name) for field in fields(holder)]
-    tensors = [value for value in values if isinstance(value, torch.Tensor)]
-    inner = [value for value in values if hasattr(value, "__dataclass_fields__")]
-    return sum(tensor.untyped_storage().nbytes() for tensor in tensors) + sum(kept_bytes(value) for value in inner)
-
-
 @pytest.mark.parametrize("spare", [None, 7])
 @pytest.mark.parametrize("keep_emit_order", [False, True])
 def test_lists_keep_no_more_memory_than_they_use(device, keep_emit_order, spare):
@@ -166,7 +159,7 @@ def test_lists_keep_no_more_memory_than_they_use(device, keep_emit_order, spare)
     one_sort = 0 if keep_emit_order else 4 * intersections + 8 * 500 - 8
     masks = 0 if lists.subtile_masks is None else intersections
     total = 4 * (2 * GRID.tiles + intersections + by_gaussian) + masks + total_and_overflow + one_sort
-    assert kept_bytes(lists) == total
+    assert sum(tensor.untyped_storage().nbytes() for tensor in tensors_of(lists)) == total
 
 
 @pytest.mark.parametrize("keep_emit_order", [True, False])

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...rasterizer.checks import integer
 from ...rasterizer.memory import oom_context
-from ...rasterizer.rasterization import render_projected
+from ...rasterizer.rasterization import render_projected, replay_projected
 from ...rasterizer.render_options import MAX_SIDE, RenderOptions
 from ...rasterizer.torch_contract import torch_operation
 from .inputs import UNSUPPORTED, check_supported, split_views
@@ -161,14 +161,10 @@ def rasterization(
                 features.append(projected.depths[:, None])
             features = torch.cat(features, 1) if len(features) > 1 else features[0]
             store = None if absolute is None else partial(absolute.__setitem__, rows)
+            inputs = projected, features, RenderOptions(*size)  # The projection has read the others.
             # The number of packed Gaussians differs from view to view, so no CUDA graph fits two of them.
-            rendering = render_projected(
-                projected,
-                features,
-                RenderOptions(*size),  # The projection has read the others.
-                replays=not packed,
-                store_absolute=store,
-            )
+            replayed = None if packed or store else replay_projected(*inputs)
+            rendering = render_projected(*inputs, store) if replayed is None else replayed
             image, transmittance = rendering.image, rendering.transmittance
             if view.background is not None:
                 behind = view.background

@@ -7,8 +7,8 @@ and results out.
 This applies to calls of rasterize() and, with packed=False, of gsplat's rasterization(). A training captures its whole
 step as one CUDA graph (training/step_graphs.py); within it, and with max_intersections, calls are launched.
 
-A call, from top to bottom: find_pool() or get_or_create_pool() returns the GraphPool of calls like it; begin_render()
-takes one of its graphs (captured_render.py), and that GraphInUse renders. torch's backward pass then calls its
+A call, from top to bottom: pool_for() returns the GraphPool of calls like it; begin_render() takes one of its graphs
+(render_graph.py), and that GraphInUse renders. torch's backward pass then calls its
 blend_backward() and project_backward() (captured_backward.py).
 """
 
@@ -18,19 +18,19 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch._C._dynamo.guards import TensorGuards
 
 from ..blending import BlendResult
-from ..projection import RasterTensors, Splats, with_projection_gradient
+from ..projection import GaussiansAndCamera, Splats, with_projection_gradient
 from ..render_options import RenderOptions
 from ..tile_lists import MAX_SINGLE_SORT
 from ..warp_launch.launching import stream_handle
 from .captured_backward import GradientMemory
-from .captured_render import CapturedRender
+from .render_graph import RenderGraph
 from .runner import is_capturing, replays_are_off
 
 LOG = logging.getLogger(__name__)
@@ -43,10 +43,10 @@ MAX_PIXELS = 1 << 21  # Larger images keep the GPU busy without CUDA graphs.
 MAX_GAUSSIANS = 1 << 21
 
 
-def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
-    """Return the CUDA graphs of calls like this one; None if there are none yet, or the call cannot be captured.
+def checked_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
+    """Return pool_for() a call if there is one: a call like it was then checked, and this one need not be.
 
-    tensors, options: as their user passed them. If calls like this one are known, they were checked before.
+    tensors, options: as their user passed them, of any type.
     """
     try:
         pool = _known_pool(tensors, options)
@@ -59,8 +59,8 @@ def find_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | No
     return pool
 
 
-def get_or_create_pool(tensors: Sequence[Tensor], options: RenderOptions) -> "GraphPool | None":
-    """Return the CUDA graphs of calls like this one, an empty pool at first; None if the call cannot be captured."""
+def pool_for(tensors: Sequence[Tensor], options: RenderOptions) -> "GraphPool | None":
+    """Return the CUDA graphs of calls like this one, an empty pool at first; None on the CPU and if none can be."""
     first = tensors[0]
     if not on_gpu(first) or first.dtype != torch.float32:
         return None
@@ -118,20 +118,6 @@ def on_gpu(tensor: Tensor) -> bool:
     return tensor.is_cuda
 
 
-class ReplayedRender(NamedTuple):
-    """A render by a CUDA graph: `blended` without gradients, the others as functions of the call's tensors.
-
-    conics_opacities stands for both in the autograd graph, see CapturedBackward; None without gradients.
-    """
-
-    graph: "GraphInUse"
-    blended: BlendResult
-    means2d: Tensor
-    depths: Tensor
-    extents: Tensor
-    conics_opacities: Tensor | None
-
-
 class GraphInUse:
     """A CUDA graph that renders one call, and that no other call gets until this object is deleted.
 
@@ -139,7 +125,7 @@ class GraphInUse:
     refer to the tensors that the nodes return, which would keep it alive for ever.
     """
 
-    def __init__(self, pool: "GraphPool", graph: CapturedRender) -> None:
+    def __init__(self, pool: "GraphPool", graph: RenderGraph) -> None:
         """Keep the CUDA graph from other calls."""
         self._pool, self._idle, self._graph = pool, pool.idle, graph
         self._prepared: GradientMemory | None = None  # For the next backward pass of the blend.
@@ -149,18 +135,21 @@ class GraphInUse:
         """Return the CUDA graph to the pool."""
         self._idle.append(self._graph)
 
-    def render(self, tensors: RasterTensors) -> ReplayedRender:
-        """Project and render."""
+    def render(self, tensors: GaussiansAndCamera) -> tuple[BlendResult, Tensor, Tensor, Tensor, Tensor | None]:
+        """Project and render; return the image, and means2d, depths, extents, and CapturedBackward.conics_opacities.
+
+        The image has no gradient, the others are functions of the tensors. The last one is None without gradients.
+        """
         backward = self._graph.backward
         image, transmittance, (means2d, depths, extents), self._prepared = self._graph.replay(tensors)
         blended = BlendResult(image, transmittance, self.blend_backward)
         if backward is None:
-            return ReplayedRender(self, blended, means2d, depths, extents, None)
+            return blended, means2d, depths, extents, None
         assert backward.conics_opacities is not None, "the CUDA graph begins with 2D Gaussians"
         outputs = means2d, backward.conics_opacities.detach(), depths, extents
-        outputs = with_projection_gradient(outputs, tensors.of_projection, self.project_backward)
+        outputs = with_projection_gradient(outputs, tensors.without_features, self.project_backward)
         means2d, conics_opacities, depths, extents = outputs
-        return ReplayedRender(self, blended, means2d, depths, extents, conics_opacities)
+        return blended, means2d, depths, extents, conics_opacities
 
     def render_projected(self, splats: Splats) -> BlendResult:
         """Render; write the extents that are left, see pack_splats()."""
@@ -179,7 +168,7 @@ class GraphInUse:
         return None
 
     def blend_backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        """Return the gradients by means2d, features, and GradientMemory.zeros, or those by conics and opacities."""
+        """Return the gradients by what was blended, see CapturedBackward.blend()."""
         backward = self._graph.backward
         assert backward is not None
         memory, self._prepared = self._prepared or backward.allocate(), None
@@ -213,10 +202,10 @@ class GraphPool:
     launched: int = 0  # Calls that were launched
     captured: int = 0  # CUDA graphs that were captured since the memory last grew
     intersections: int = 0  # The least number that the next CUDA graph allocates memory for
-    idle: list[CapturedRender] = field(default_factory=list)  # CUDA graphs that no call holds
+    idle: list[RenderGraph] = field(default_factory=list)  # CUDA graphs that no call holds
     last_use: int = 0  # Number of the last call
 
-    def begin_render(self, tensors: RasterTensors | Splats, options: RenderOptions) -> GraphInUse | None:
+    def begin_render(self, tensors: GaussiansAndCamera | Splats, options: RenderOptions) -> GraphInUse | None:
         """Return a CUDA graph for one render, from Splats if they are projected already.
 
         None if the call is to be launched instead.
@@ -227,14 +216,14 @@ class GraphPool:
             graph = self._capture(tensors, options)
         return None if graph is None else GraphInUse(self, graph)
 
-    def _capture(self, tensors: RasterTensors | Splats, options: RenderOptions) -> CapturedRender | None:
+    def _capture(self, tensors: GaussiansAndCamera | Splats, options: RenderOptions) -> RenderGraph | None:
         self.launched += 1
         if self.launched <= WARMUP_CALLS or self.captured >= self.max_graphs:
             return None
         self.captured += 1
         try:
             with torch.inference_mode(False), torch.no_grad():
-                return CapturedRender(tensors, options, self.intersections, self.differentiable)
+                return RenderGraph(tensors, options, self.intersections, self.differentiable)
         except RuntimeError:
             LOG.debug("a render could not be captured and is launched", exc_info=True)
             self.captured = self.max_graphs

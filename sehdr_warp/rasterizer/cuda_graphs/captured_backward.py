@@ -31,8 +31,9 @@ class _View(NamedTuple):
 class GradientMemory:
     """Zeros that a backward pass of blend and projection adds to, and the views of them that it returns.
 
-    of_splats: by means2d and features, and if the CUDA graph begins with 2D Gaussians, by conics and opacities; emptied
-    when they are returned, because torch takes a leaf's gradient without a copy only if nothing else refers to it.
+    of_splats: by features and means2d; if the CUDA graph begins with 2D Gaussians, by features, conics, means2d and
+    opacities. Emptied when they are returned, because torch takes a leaf's gradient without a copy only if nothing else
+    refers to it.
     of_gaussians: by the projection's inputs, None where not needed.
     """
 
@@ -96,7 +97,7 @@ class CapturedBackward:
         self._layout, self.conics_opacities = layout, layout.like if gaussians else None
         self._blend, rows = blend.on_fixed_memory()
         self._stream = warp_stream(rows.device)  # Torch differentiates on the stream of the forward pass.
-        self._of_splats = [layout.means2d, layout.features]
+        self._of_splats = [layout.features, layout.means2d]
         if layout.copies_features:
             copy = rows.new_empty(layout.features.shape)
             kernel = copy_features_kernel(warp_scalar(rows.dtype))
@@ -107,7 +108,7 @@ class CapturedBackward:
             self._projection_offsets = [view.begin * rows.element_size() for view in of_projection]
             self._project = _fixed_projection_backward(gaussians, layout, options, projected, rows)
         else:
-            self._of_splats += layout.conics, layout.opacities
+            self._of_splats = [layout.features, layout.conics, layout.means2d, layout.opacities]
 
     def allocate(self, zeros: Tensor | None = None) -> GradientMemory:
         """Return memory for one backward pass.
@@ -121,7 +122,7 @@ class CapturedBackward:
         return GradientMemory(zeros, of_splats, of_gaussians)
 
     def blend(self, memory: GradientMemory, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        """Return the gradients by means2d, features, and conics and opacities, as one or each."""
+        """Return the gradients by GradientMemory.of_splats and, if the graph projects, by conics_opacities."""
         rows = memory.zeros.data_ptr()
         transmittance = 0 if grad_transmittance is None else grad_transmittance.data_ptr()
         self._blend.launch((), (grad_image.data_ptr(), transmittance, rows), self._stream)

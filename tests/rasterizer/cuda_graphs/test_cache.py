@@ -15,7 +15,7 @@ from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.rasterizer import block_blending, rasterize, render_options, tile_lists
-from sehdr_warp.rasterizer.cuda_graphs import cache, captured_render
+from sehdr_warp.rasterizer.cuda_graphs import cache, render_graph
 from sehdr_warp.rasterizer.memory import OutOfMemory
 from sehdr_warp.rasterizer.render_options import RenderOptions
 from sehdr_warp.response import response_by_name
@@ -48,9 +48,9 @@ def values_and_gradients(splat, scene, *, by_alpha=True, **options):
 @pytest.mark.parametrize("options", [{}, {"by_alpha": False}, {"depth": True, "antialiased": True}])
 def test_replays_follow_their_arguments_and_their_need_of_room(options, many, monkeypatch):
     if many:  # As with more Gaussians than one sort takes.
-        for module in (tile_lists, block_blending, captured_render, cache):
+        for module in (tile_lists, block_blending, render_graph, cache):
             monkeypatch.setattr(module, "MAX_SINGLE_SORT", 0)
-        monkeypatch.setattr(captured_render, "MAX_COPIED_GAUSSIANS", 0)
+        monkeypatch.setattr(render_graph, "MAX_COPIED_GAUSSIANS", 0)
     for count, channels in ((80, 3), (40, 9), (80, 3)):
         scene = scene_of(count, channels)
         for growth in (0.0, 0.4, 1.5):
@@ -73,7 +73,7 @@ def test_replays_follow_their_arguments_and_their_need_of_room(options, many, mo
 @pytest.mark.parametrize("channels", [3, 4])
 def test_without_gradients_pictures_stay_too(one_sort, most_copied, channels, monkeypatch):
     monkeypatch.setattr(tile_lists, "MAX_SINGLE_SORT", one_sort)
-    monkeypatch.setattr(captured_render, "MAX_COPIED_GAUSSIANS", most_copied)
+    monkeypatch.setattr(render_graph, "MAX_COPIED_GAUSSIANS", most_copied)
     scene = scene_of(channels=channels)
     with torch.no_grad():
         arguments = [[*scene.arguments[:4], scene.tensors[4] * k, *scene.arguments[5:]] for k in range(1, 9)]
@@ -123,7 +123,7 @@ def test_a_feature_that_is_not_finite_is_culled_in_a_replay_as_well():
 
 def test_calls_are_recorded_after_some_and_hold_what_they_were_given(monkeypatch):
     labels = iter("abcdefgh")
-    monkeypatch.setattr(cache, "CapturedRender", lambda tensors, options, pairs, differentiable: next(labels))
+    monkeypatch.setattr(cache, "RenderGraph", lambda tensors, options, pairs, differentiable: next(labels))
     pool = cache.GraphPool()
 
     def take():
@@ -138,7 +138,7 @@ def test_calls_are_recorded_after_some_and_hold_what_they_were_given(monkeypatch
     pool.grow(50)
     del in_use
     assert pool.idle == [], "too small, they are let go"
-    monkeypatch.setattr(cache, "CapturedRender", lambda tensors, options, pairs, differentiable: pairs)
+    monkeypatch.setattr(cache, "RenderGraph", lambda tensors, options, pairs, differentiable: pairs)
     assert take()._graph == 70
 
 
@@ -149,7 +149,7 @@ def test_what_cannot_be_recorded_is_launched(monkeypatch):
         requests.append(intersections)
         raise torch.OutOfMemoryError("no memory")
 
-    monkeypatch.setattr(cache, "CapturedRender", record)
+    monkeypatch.setattr(cache, "RenderGraph", record)
     calls = cache.WARMUP_CALLS + 5
     assert not any(pool.begin_render((), RenderOptions(8, 8)) for _ in range(calls)) and len(requests) == 1
 
@@ -185,11 +185,11 @@ def test_only_the_latest_kinds_are_remembered():
     tensors = scene.tensors
 
     def graphs(width):
-        return cache.get_or_create_pool(tensors, RenderOptions(width, 8))
+        return cache.pool_for(tensors, RenderOptions(width, 8))
 
-    assert cache.find_pool(tensors, RenderOptions(1, 8)) is None
+    assert cache.checked_pool(tensors, RenderOptions(1, 8)) is None
     kinds = [graphs(1 + n) for n in range(cache.MAX_POOLS)]
-    assert graphs(1) is kinds[0] and cache.find_pool(tensors, RenderOptions(1, 8)) is kinds[0]
+    assert graphs(1) is kinds[0] and cache.checked_pool(tensors, RenderOptions(1, 8)) is kinds[0]
     graphs(99)
     assert graphs(1) is kinds[0] and graphs(2) is not kinds[1]
 
@@ -245,7 +245,7 @@ def test_a_call_that_is_known_is_refused_within_a_capture(monkeypatch):
         with pytest.raises(RuntimeError, match="give max_intersections"):
             if DEVICE == "cpu":
                 with monkeypatch.context() as patch:
-                    patch.setattr(captured_render.CapturedRender, "replay", refuse_as_torch_does)
+                    patch.setattr(render_graph.RenderGraph, "replay", refuse_as_torch_does)
                     patch.setattr(render_options, "is_capturing", lambda device: True)
                     rasterize(*scene.arguments)
             with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=stream):
@@ -268,7 +268,7 @@ def test_options_that_equal_those_of_known_calls_are_checked_as_well():
 
 
 def test_a_count_is_waited_for_while_other_threads_run_and_missed_if_the_gpu_is_idle():
-    graph = object.__new__(captured_render.CapturedRender)
+    graph = object.__new__(render_graph.RenderGraph)
     graph._count, ended = ctypes.c_int64(-1), threading.Event()
     graph._stream = SimpleNamespace(query=ended.is_set)
 

@@ -5,7 +5,6 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,11 +12,11 @@ from torch import Tensor
 from ...kernels.caller_memory import write_last
 from ...kernels.project import projection_kernel
 from ..block_blending import BlockBackward, blend_on_cuda, fixed_blend_blocks
-from ..projection import ProjectedGaussians, RasterTensors, Splats, project_to_camera, projection_parameters
+from ..projection import GaussiansAndCamera, ProjectedGaussians, Splats, project_to_camera, projection_parameters
 from ..render_options import MAX_INTERSECTIONS, RenderOptions
 from ..tile_lists import (
     MAX_SINGLE_SORT,
-    IntersectionOffsets,
+    EmitOrder,
     PackedSplats,
     TileLists,
     build_tile_lists,
@@ -37,25 +36,10 @@ HEADROOM = 1.25  # Memory for intersections, as a multiple of those of the captu
 MIN_INTERSECTIONS = 1 << 12
 # On Linux time.sleep(0) takes 50 us, to which timers are rounded up.
 _let_other_threads_run: Callable[[], object] = getattr(os, "sched_yield", partial(time.sleep, 0))
+Outputs = tuple[Tensor, Tensor, Sequence[Tensor], GradientMemory | None]
 
 
-class ReplayResult(NamedTuple):
-    """Tensors that a replayed CUDA graph has written.
-
-    Attributes:
-        image: [H, W, C].
-        transmittance: [H, W].
-        others: means2d, depths and extents; extents alone if the graph begins with 2D Gaussians.
-        gradients: for the backward pass; None if that allocates them.
-    """
-
-    image: Tensor
-    transmittance: Tensor
-    others: Sequence[Tensor]
-    gradients: GradientMemory | None
-
-
-class CapturedRender:
+class RenderGraph:
     """One render on fixed memory as a CUDA graph, which also copies the number of intersections to the host.
 
     The graph copies inputs in and results out, see CallerMemory. With many Gaussians and without gradients these copies
@@ -68,19 +52,19 @@ class CapturedRender:
     """
 
     def __init__(
-        self, tensors: RasterTensors | Splats, options: RenderOptions, intersections: int, differentiable: bool
+        self, tensors: GaussiansAndCamera | Splats, options: RenderOptions, intersections: int, differentiable: bool
     ) -> None:
         """Launch the render once, then capture it.
 
         intersections: the least number to allocate memory for. differentiable: whether gradients are needed.
         """
-        projects, many = isinstance(tensors, RasterTensors), len(tensors[0]) > MAX_COPIED_GAUSSIANS
+        projects, many = isinstance(tensors, GaussiansAndCamera), len(tensors[0]) > MAX_COPIED_GAUSSIANS
         self._options, self._are_contiguous = options, all(tensor.is_contiguous() for tensor in tensors)
         self._copies = differentiable or options.depth or not projects or not many
         self._inputs = [tensor.detach().contiguous() for tensor in tensors]
         if self._copies:
             self._inputs = [tensor.clone() for tensor in self._inputs]
-        self._to_project = RasterTensors(*self._inputs) if projects else None
+        self._to_project = GaussiansAndCamera(*self._inputs) if projects else None
         first, channels = self._inputs[0], tensors.features.shape[1] + (options.depth and projects)
         self._image = first.new_empty(options.height, options.width, channels)
         self._transmittance = first.new_empty(options.height, options.width)
@@ -93,21 +77,21 @@ class CapturedRender:
         # Launched once: nothing may be compiled or loaded during a capture, and it tells how much memory is needed.
         splats, packed = self._project_and_pack()
         with self._runner.on_capture_stream():
-            offsets = self._order_and_count(packed)
-            limit = int(HEADROOM * max(intersections, int(offsets.cumulative_counts[-1])))
+            emit_order = self._order_and_count(packed)
+            limit = int(HEADROOM * max(intersections, int(emit_order.cumulative_counts[-1])))
             self.max_intersections = min(max(MIN_INTERSECTIONS, limit), MAX_INTERSECTIONS)
-            layout = self._layout_for(tensors, self._blend(splats, packed, self._list(packed, offsets)))
+            layout = self._layout_for(tensors, self._blend(splats, packed, self._list(packed, emit_order)))
             # With more Gaussians memory is worth more than the host's time.
             self._gradients = layout.like if differentiable and not many else None
             if self._copies:
                 self._callers.read(self._inputs)
                 self._write(splats)
-            del offsets
+            del emit_order
         if self._copies:
             del splats, packed  # The captured render has its own.
             splats, blend = self._runner.capture(None, self._render)
             if differentiable:
-                gaussians = () if self._to_project is None else self._to_project.of_projection
+                gaussians = () if self._to_project is None else self._to_project.without_features
                 projected = ProjectedGaussians(*splats[:-1])
                 self.backward = CapturedBackward(layout, blend, gaussians, options, projected)
         else:
@@ -132,13 +116,13 @@ class CapturedRender:
         pads = not self._copies or self._image.shape[2] % 4 > 0
         return splats, pack_splats(splats, options.alpha_threshold, options.width, options.height, pads=pads)
 
-    def _order_and_count(self, packed: PackedSplats) -> IntersectionOffsets:
-        offsets = order_intersections(packed, keep_emit_order=False)
-        launch(write_last, 1, offsets.cumulative_counts, self._counter)  # What follows waits longer for a copy.
-        return offsets
+    def _order_and_count(self, packed: PackedSplats) -> EmitOrder:
+        emit_order = order_intersections(packed, keep_emit_order=False)
+        launch(write_last, 1, emit_order.cumulative_counts, self._counter)  # What follows waits longer for a copy.
+        return emit_order
 
-    def _list(self, packed: PackedSplats, offsets: IntersectionOffsets) -> TileLists:
-        return build_tile_lists(packed, offsets, self._options.width, self._options.height, self.max_intersections)
+    def _list(self, packed: PackedSplats, emit_order: EmitOrder) -> TileLists:
+        return build_tile_lists(packed, emit_order, self._options.width, self._options.height, self.max_intersections)
 
     def _blend(self, splats: Splats, packed: PackedSplats, lists: TileLists) -> BlockBackward:
         outputs, threshold = (self._image, self._transmittance), self._options.alpha_threshold
@@ -152,11 +136,11 @@ class CapturedRender:
         """Return what a render returns beside image and transmittance."""
         return [splats.extents] if self._to_project is None else [splats.means2d, splats.depths, splats.extents]
 
-    def _layout_for(self, tensors: RasterTensors | Splats, blend: BlockBackward) -> GradientLayout:
+    def _layout_for(self, tensors: GaussiansAndCamera | Splats, blend: BlockBackward) -> GradientLayout:
         """Return the layout of the gradients that these tensors of a call require."""
-        if self._to_project is None or not isinstance(tensors, RasterTensors):
+        if self._to_project is None or not isinstance(tensors, GaussiansAndCamera):
             return GradientLayout(blend, [], copies_features=_is_trained(tensors.features))
-        inputs = zip(tensors.of_projection, self._to_project.of_projection, strict=True)
+        inputs = zip(tensors.without_features, self._to_project.without_features, strict=True)
         gaussians = [like if tensor.requires_grad else None for tensor, like in inputs]
         # Features with depths get their gradient through torch.cat().
         copies_features = _is_trained(tensors.features) and not self._options.depth
@@ -171,8 +155,11 @@ class CapturedRender:
         self._pack = fixed_pack_splats(splats, packed, options.alpha_threshold, *size)
         self._fixed_blend = fixed_blend_blocks(packed.padded, lists, packed, *outputs, options.alpha_threshold)
 
-    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor] = ()) -> ReplayResult:
-        """Render. Call count_intersections() before the next replay: the GPU has then read the table of addresses.
+    def replay(self, tensors: Sequence[Tensor], outputs: Sequence[Tensor] = ()) -> Outputs:
+        """Render; return image, transmittance, what follows, and memory for gradients unless a backward pass makes it.
+
+        Means2d, depths and extents follow; the extents alone if the graph begins with 2D Gaussians. Call
+        count_intersections() before the next replay: the GPU has then read the table of addresses.
 
         outputs: contiguous, to write what follows image and transmittance to. By default they are new tensors.
         """
@@ -190,20 +177,20 @@ class CapturedRender:
         self._runner.replay()
         # Views of the gradients are made while the GPU renders.
         gradients = None if zeros is None or self.backward is None else self.backward.allocate(zeros)
-        return ReplayResult(image, transmittance, others, gradients)
+        return image, transmittance, others, gradients
 
-    def _launch(self, tensors: Sequence[Tensor]) -> ReplayResult:
+    def _launch(self, tensors: Sequence[Tensor]) -> Outputs:
         """Do what replay() does without copies of the features and of the image."""
-        inputs = RasterTensors(*(tensor.contiguous() for tensor in tensors))
+        inputs = GaussiansAndCamera(*(tensor.contiguous() for tensor in tensors))
         stream = warp_stream(inputs.features.device)
-        self._project.launch((), [tensor.data_ptr() for tensor in inputs.of_projection], stream)
+        self._project.launch((), [tensor.data_ptr() for tensor in inputs.without_features], stream)
         self._pack.launch((), (inputs.features.data_ptr(),), stream)
         self._runner.replay()
         image, transmittance = torch.empty_like(self._image), torch.empty_like(self._transmittance)
         self._fixed_blend.launch((), (image.data_ptr(), transmittance.data_ptr()), stream)
         others = [torch.empty_like(result) for result in self._results]
         torch._foreach_copy_(others, self._results)  # pyright: ignore[reportPrivateImportUsage]
-        return ReplayResult(image, transmittance, others, None)
+        return image, transmittance, others, None
 
     def count_intersections(self) -> int:
         """Wait for the last render's count; return it. Those beyond max_intersections were left out."""
@@ -222,16 +209,18 @@ def _is_trained(tensor: Tensor) -> bool:
     return tensor.is_leaf and tensor.requires_grad
 
 
-def _project(tensors: RasterTensors, options: RenderOptions) -> Splats:
-    projected, features = project_to_camera(*tensors.of_projection, options=options), tensors.features
+def _project(tensors: GaussiansAndCamera, options: RenderOptions) -> Splats:
+    projected, features = project_to_camera(*tensors.without_features, options=options), tensors.features
     if options.depth:
         features = torch.cat([features, projected.depths[:, None]], 1)
     return Splats(*projected, features)
 
 
-def _fixed_projection(tensors: RasterTensors, options: RenderOptions, projected: ProjectedGaussians) -> FixedLaunch:
+def _fixed_projection(
+    tensors: GaussiansAndCamera, options: RenderOptions, projected: ProjectedGaussians
+) -> FixedLaunch:
     """Return the launch of _project() for any tensors, to the same outputs."""
-    gaussians = tensors.of_projection
+    gaussians = tensors.without_features
     kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased, False)
     arguments = *gaussians, *projection_parameters(options), None, *projected
     return fixed_launch(kernel, len(projected.depths), *arguments, by_address=gaussians)
