@@ -111,11 +111,17 @@ def check_render_options(near_plane: Any, alpha_threshold: Any) -> None:
     real("alpha_threshold", alpha_threshold, lambda number: 1e-37 < number < 1.0, "between 1e-37 and 1")
 
 
+def check_memory(**tensors: Tensor) -> None:
+    """Raise TypeError for tensors without memory, as FakeTensor and DTensor."""
+    for name, tensor in tensors.items():
+        if tensor.numel() and not tensor.data_ptr():
+            raise TypeError(f"{name} is a {type(tensor).__name__}, which has no memory; pass a plain tensor")
+
+
 def check_opacities(opacities: Tensor) -> None:
     """Raise ValueError for opacities on the CPU that are finite and outside of [0, 1], TypeError without memory."""
+    check_memory(opacities=opacities)
     if opacities.device.type == "cpu" and opacities.numel():
-        if not opacities.data_ptr():
-            raise TypeError(f"opacities is a {type(opacities).__name__}, which has no memory; pass a plain tensor")
         values = opacities.detach()
         low, high = (float(value) for value in values.aminmax())
         if not (math.isfinite(low) and math.isfinite(high)):

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from torch import distributed
+from torch.distributed.tensor import distribute_tensor, init_device_mesh
 
 from sehdr_warp.rasterizer import rasterize, rasterize_directions, spherical_harmonics, ssim
 
@@ -156,3 +158,13 @@ def test_misfits_of_harmonics_are_named(degree, change, kind, message):
 def test_misfits_of_similarity_are_named(a, b, kind, message):
     with pytest.raises(kind, match=message):
         ssim(a, b)
+
+
+def test_distributed_tensors_are_refused_by_a_sentence():
+    distributed.init_process_group("gloo", store=distributed.HashStore(), rank=0, world_size=1)
+    try:
+        image = distribute_tensor(torch.rand(12, 12, 3), init_device_mesh("cpu", (1,)))
+        with pytest.raises(TypeError, match="a is a DTensor, which has no memory; pass a plain tensor"):
+            ssim(image, image)
+    finally:
+        distributed.destroy_process_group()

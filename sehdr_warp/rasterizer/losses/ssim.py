@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ...kernels.ssim import RADIUS, ssim_kernels, window
 from ...kernels.ssim_cuda import ssim_patch_kernels
-from ..checks import check_tensors
+from ..checks import check_memory, check_tensors
 from ..gradients import constant, scale_gradient, unit_gradient
 from ..torch_contract import once_differentiable, torch_operation
 from ..warp_launch.launching import launch, warp_scalar
@@ -114,6 +114,7 @@ class _Similarity(torch.autograd.Function):
 
 def _check(a: Tensor, b: Tensor) -> None:
     check_tensors(a=(a, ("H", "W", "C")), b=(b, ("H", "W", "C")))
+    check_memory(a=a, b=b)
     if not a.numel():
         raise ValueError(f"a has shape {list(a.shape)}, expected [H, W, C] with a pixel at least")
 
