@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from ..rasterizer.render_options import EPS2D
 from ..scene import Camera
+from ..scene.wide_camera import pixels_of_directions
 from ..subsets import every_nth
 from .renders import CameraTensors
 
@@ -84,11 +85,13 @@ def photo_filters(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     nearest, index = KDTree(np.stack([camera.position for camera in cameras])).query(means)
     count, logarithms = np.zeros(len(means)), np.zeros(len(means))
     for camera, angle in zip(every_nth(cameras, MOST_CAMERAS), every_nth(angles, MOST_CAMERAS), strict=True):
-        rows, tilts = slice(None), 0.0
         if camera.is_pinhole:
             projected = camera.project(means)
             rows = np.flatnonzero(projected.inside)
             tilts = np.log(projected.depth[rows])
+        else:
+            local = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+            rows, tilts = np.flatnonzero(np.isfinite(pixels_of_directions(local, camera)).all(axis=1)), 0.0
         distances = np.log(np.maximum(np.linalg.norm(means[rows] - camera.position, axis=1), NEAR))
         # A pixel covers depth^3 / (distance fx fy) of a sphere about the camera at this distance.
         logarithms[rows] += math.log(angle) + (1.5 * tilts - 0.5 * distances if camera.is_pinhole else distances)

@@ -55,18 +55,20 @@ def _fisheye_directions(projection: str, x: np.ndarray, y: np.ndarray, distortio
 
 def fisheye_angles(projection: str, distortion: tuple, radius: np.ndarray) -> np.ndarray:
     """Return the angles from the axis, radians, that a fisheye lens shows at radii in focal lengths; NaN beyond."""
-    # By a table of theta_d(theta), which must rise: what lies behind its first maximum is not seen.
     theta = np.linspace(0, np.pi, 8192)
-    bent = theta * np.polynomial.polynomial.polyval(theta**2, [1.0, *_radial_terms(projection, distortion)])
-    falling = np.flatnonzero(np.diff(bent) <= 0)
-    last = int(falling[0]) if len(falling) else len(theta) - 1
-    return np.interp(radius, bent[: last + 1], theta[: last + 1], right=np.nan)
+    bent = _fisheye_radii(projection, distortion, theta)
+    seen = np.isfinite(bent)
+    return np.interp(radius, bent[seen], theta[seen], right=np.nan)
 
 
-def _radial_terms(projection: str, distortion: tuple) -> tuple[float, ...]:
-    """Return the coefficients of theta^3, theta^5, ... of a fisheye model."""
+def _fisheye_radii(projection: str, distortion: tuple, theta: np.ndarray) -> np.ndarray:
+    """Return theta_d(theta), radii in focal lengths; NaN from its first maximum on, behind which nothing is seen."""
     counts = {"OPENCV_FISHEYE": 4, "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2}
-    return tuple(distortion[: counts.get(projection, 0)])
+    model = np.polynomial.Polynomial([0.0, 1.0])
+    for power, term in enumerate(distortion[: counts.get(projection, 0)], 1):
+        model += np.polynomial.Polynomial([0.0] * (2 * power + 1) + [term])
+    maxima = [root.real for root in model.deriv().roots() if abs(root.imag) < 1e-9 and root.real > 0]
+    return np.where(theta < min(maxima, default=np.inf), model(theta), np.nan)
 
 
 def solid_angles(camera: Camera) -> np.ndarray:
@@ -117,9 +119,8 @@ def pixels_of_directions(directions: np.ndarray, camera: Camera) -> np.ndarray:
         return np.stack([row, column], axis=-1)
     across = np.hypot(x, y)
     theta = np.arctan2(across, z)
-    terms = _radial_terms(camera.projection, camera.distortion)
-    bent = theta * np.polynomial.polynomial.polyval(theta**2, [1.0, *terms])
-    scale = np.where(across > 1e-12, bent / np.maximum(across, 1e-12), 1.0)
+    bent = _fisheye_radii(camera.projection, camera.distortion, theta)
+    scale = np.where(across > 1e-12, bent / np.maximum(across, 1e-12), np.where(z > 0, 1.0, np.nan))
     column, row = camera.fx * x * scale + camera.cx - 0.5, camera.fy * y * scale + camera.cy - 0.5
     inside = (column >= -0.5) & (column <= camera.width - 0.5) & (row >= -0.5) & (row <= camera.height - 0.5)
     return np.where(inside[..., None], np.stack([row, column], axis=-1), np.nan)

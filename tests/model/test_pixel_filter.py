@@ -89,6 +89,14 @@ def test_the_filter_of_photos_is_the_mean_of_cameras_that_show_a_place_or_of_the
     np.testing.assert_allclose(photo_filters(middle, [replace(FISHEYE, world_to_camera=pose_at(3.0))]), 3 * pixel)
 
 
+@pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.1, 0.0)], ids=["to 180 degrees", "to 105 degrees"])
+def test_fisheye_photos_have_no_part_in_filters_of_what_is_behind_them(distortion):
+    pixel, place = math.sqrt(EPS2D) / 40, np.array([[0.0, 0, 0]])
+    ahead = replace(FISHEYE, projection="RADIAL_FISHEYE", distortion=distortion, world_to_camera=pose_at(2.0))
+    behind = replace(ahead, world_to_camera=pose_at(-8.0))
+    np.testing.assert_allclose(photo_filters(place, [ahead, behind]), 2 * pixel)
+
+
 def pose_at(depth):
     """A camera that far in front of the origin."""
     pose = np.eye(4)

@@ -46,6 +46,16 @@ def test_pixels_and_directions_are_inverse(camera):
     )
 
 
+def test_a_lens_shows_nothing_beyond_its_widest_angle():
+    """theta - 0.1 theta^3 is largest at 105 degrees and 0 again behind the camera."""
+    camera = Camera(200, 200, 60.0, 60.0, 100.0, 100.0, np.eye(4), "SIMPLE_RADIAL_FISHEYE", (-0.1,))
+    angles = np.radians([0, 60, 104, 106, 150, 179, 180])
+    directions = np.stack([np.sin(angles), np.zeros(7), np.cos(angles)], 1)
+    shown = np.isfinite(pixels_of_directions(directions, camera)).all(1)
+    assert shown.tolist() == [True, True, True, False, False, False, False]
+    assert len(faces_of(colored(camera))) == 5, "none of what is behind"
+
+
 def test_directions_are_those_of_colmap():
     pycolmap = pytest.importorskip("pycolmap")
     for camera, params in ((panorama(), [WIDTH, HEIGHT]), (fisheye(), FISHEYE)):
