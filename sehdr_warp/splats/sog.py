@@ -1,7 +1,8 @@
 """SOG (PlayCanvas), version 2: a ZIP of lossless WebP pictures and meta.json; display colors, about a tenth of a PLY.
 
 Positions are 16 bits of a logarithm, sizes and colors codes of 256 levels, higher harmonics entries of a palette. Axes
-are those of PLY. What this package adds stands under `sehdr` in meta.json.
+are those of PLY. What this package adds stands under `sehdr` in meta.json, and in filters.webp: of each Gaussian, the
+part of its smallest size that remains without the photos' filter.
 """
 
 import io
@@ -20,7 +21,7 @@ from PIL import Image
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import GaussianArrays, log_compensation, read_matrix
+from .arrays import GaussianArrays, log_compensation, read_focals, read_matrix
 from .packing import CODES, codebook, from_smallest_three, logits, morton_order, palette, smallest_three
 
 _LARGEST_PALETTE, _PER_ENTRY, _ACROSS = 1 << 14, 2, 64  # Entries; Gaussians for each; entries side by side
@@ -73,6 +74,13 @@ def sog_files(gaussians: GaussianArrays) -> Iterator[tuple[str, str | bytes]]:
     }
     if gaussians.world_matrix is not None:
         meta["sehdr"]["world_matrix"] = gaussians.world_matrix.tolist()
+    if (shares := gaussians.filter_shares) is not None:
+        levels, codes = codebook(np.sqrt(1 - np.square(np.clip(shares, 0, 1)))[:, None])
+        files = [pictures.add("filters.webp", codes)]
+        meta["sehdr"] |= {
+            "photo_focals": gaussians.photo_focals,
+            "filters": {"codebook": levels.tolist(), "files": files},
+        }
     if gaussians.degree:
         meta["shN"] = _add_higher_harmonics(gaussians, pictures)
     yield "meta.json", json.dumps(meta)
@@ -170,14 +178,14 @@ def _gaussians(read: Callable[[str, int], bytes], meta: dict[str, Any], path: Pa
 
     most = min(_MOST_PIXELS, 4 * count + _SPARE_PIXELS)
 
-    def texels(part: str, index: int = 0) -> np.ndarray:
-        values = _picture(read, meta[part]["files"][index], most).reshape(-1, 4)
+    def texels(part: str, index: int = 0, parts: dict[str, Any] = meta) -> np.ndarray:
+        values = _picture(read, parts[part]["files"][index], most).reshape(-1, 4)
         if len(values) < count:
             raise ValueError(f"{part} has {len(values)} texels for {count} Gaussians")
         return values[:count]
 
-    def levels(part: str) -> np.ndarray:
-        values = np.array(meta[part]["codebook"], np.float32)
+    def levels(part: str, parts: dict[str, Any] = meta) -> np.ndarray:
+        values = np.array(parts[part]["codebook"], np.float32)
         if values.shape != (CODES,):
             raise ValueError(f"the codebook of {part} has shape {values.shape}")
         return values
@@ -198,7 +206,7 @@ def _gaussians(read: Callable[[str, int], bytes], meta: dict[str, Any], path: Pa
         entries = _picture(read, meta["shN"]["files"][0], _SPARE_PIXELS)
         entries = entries.reshape(len(entries) * _ACROSS, _COEFFICIENTS[degree], 4)[..., :3]
         harmonics[:, 1:] = levels("shN")[entries[columns[:, 0] + 256 * columns[:, 1]]]
-    return GaussianArrays(
+    gaussians = GaussianArrays(
         means=means.astype(np.float32),
         log_scales=levels("scales")[texels("scales")[:, :3]],
         quaternions=from_smallest_three(turns[:, 3] - 252, turns[:, :3] / 255 * 2 - 1),
@@ -208,7 +216,12 @@ def _gaussians(read: Callable[[str, int], bytes], meta: dict[str, Any], path: Pa
         base_time=float(facts.get("base_exposure_time", 1.0)),
         world_matrix=read_matrix(facts.get("world_matrix"), path),
         antialiased=meta.get("antialias") is True,
+        photo_focals=read_focals(facts.get("photo_focals"), path),
     )
+    if gaussians.photo_focals is None or not gaussians.antialiased or "filters" not in facts:
+        return gaussians
+    remains = levels("filters", facts)[texels("filters", 0, facts)[:, 0]]
+    return gaussians.without_filter(np.sqrt(1 - np.square(np.clip(remains, 0, 1))))
 
 
 def _picture(read: Callable[[str, int], bytes], name: str, most: int) -> np.ndarray:
