@@ -50,10 +50,12 @@ def test_a_place_that_cannot_be_used_is_done_without(monkeypatch, caplog, place)
 
 
 END = """
-import atexit, os, signal, sys
+import os, signal, sys
 import warp as wp
 from pathlib import Path
 from sehdr_warp.process import prepare
+
+wp.config.kernel_cache_dir = sys.argv[1] + "/empty"  # Not the user's: another test may compile into that meanwhile.
 from sehdr_warp.rasterizer.warp_launch import kernel_cache
 
 wp.config.kernel_cache_dir = sys.argv[1]
