@@ -23,6 +23,13 @@ def available_devices() -> list[str]:
     return ["cpu", "cuda:0"] if torch.cuda.is_available() else ["cpu"]
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Leave out tests/trial, a third of all tests, unless -m or a path asks for it."""
+    folder = ROOT / "tests" / "trial"
+    asked = config.option.markexpr != "not trial" or any("trial" in argument for argument in config.args)
+    return True if collection_path == folder and not asked else None
+
+
 def pytest_generate_tests(metafunc):
     if "device" in metafunc.fixturenames:
         metafunc.parametrize("device", available_devices())

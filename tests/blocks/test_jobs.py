@@ -7,30 +7,19 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from benchmarks.survey import write_survey
 from sehdr_warp.blocks import jobs
-from sehdr_warp.blocks.block_plan import make_block_plan
 from sehdr_warp.blocks.job import folder_of, train_block
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.runs.config import Config
-from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.launch import installed_versions
 
-LITTLE = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_prior": False}
-
 
 @pytest.fixture(scope="module")
-def divided(tmp_path_factory):
+def divided(survey, divide, tmp_path_factory):
     """A folder with photos in `town` and a plan of two blocks in `run`, and the plan."""
     folder = tmp_path_factory.mktemp("divided")
-    write_survey(folder / "town", views=32, size=48, gaussians=6000)
-    data = {"path": str(folder / "town"), "exposure_index": None, "max_size": None, "holdout": None}
-    config = override_config(Config(), {"response.name": "srgb", "schedule.iterations": 20} | LITTLE)
-    plan = make_block_plan(data, config, torch.device("cpu"), 2)
-    (folder / "run").mkdir()
-    plan.write(folder / "run")
-    return folder, plan
+    shutil.copytree(survey, folder / "town")
+    return folder, divide(folder / "town", folder / "run", iterations=20)
 
 
 def test_a_machine_with_other_versions_trains_nothing(divided):
@@ -75,16 +64,11 @@ def test_a_file_system_that_loses_a_trained_block_is_named(divided, monkeypatch)
 
 
 @pytest.mark.parametrize(("at_once", "threads"), [(1, 8), (2, 4)])
-def test_blocks_at_once_share_the_processors(divided, monkeypatch, at_once, threads):
+def test_blocks_at_once_share_the_processors(divided, jobs_here, monkeypatch, at_once, threads):
     folder, plan = divided
     out = folder / "run"
     monkeypatch.setenv("SEHDR_THREADS", "8")
 
-    def submit(job, *arguments):
-        result = job(*arguments)
-        return SimpleNamespace(done=lambda: True, exception=lambda: None, result=lambda: result)
-
-    monkeypatch.setattr(jobs, "local_executors", lambda *_: [SimpleNamespace(submit=submit)] * at_once)
     jobs.run_blocks(out, plan, device=torch.device("cpu"), gpus=at_once)
     devices = {RunFolder(folder_of(out, plan, index)).read_summary()["device"] for index in range(2)}
     assert devices == {f"cpu ({threads} threads)"}

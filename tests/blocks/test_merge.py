@@ -11,21 +11,11 @@ from sehdr_warp.blocks.merge import merge_blocks
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_writer import RunWriter, write_confidence
 
-from .two_blocks import train_two_blocks
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """The folder of two trained blocks, and their plan."""
-    folder = tmp_path_factory.mktemp("trained")
-    plan = train_two_blocks(folder, iterations=20)
-    return folder / "run", plan
-
 
 @pytest.mark.parametrize(("margins", "fewer"), [(0.5, 0), (40, 1)])
-def test_a_gaussian_that_reaches_far_into_another_block_is_left_out(trained, margins, fewer):
+def test_a_gaussian_that_reaches_far_into_another_block_is_left_out(two_blocks, margins, fewer):
     """Its center is in its core, far from the border."""
-    out, plan = trained
+    out, plan = two_blocks(20)
     merge_blocks(out, plan, torch.device("cpu"))
     before = load_run(out)
     places = before.field.normalization.scene_points(before.field.gaussians.means.detach().numpy())
@@ -51,9 +41,9 @@ def test_a_gaussian_that_reaches_far_into_another_block_is_left_out(trained, mar
         folder.unlock()
 
 
-def test_a_cpu_leaves_the_borders_of_blocks_from_gpus_and_says_so(trained, caplog):
+def test_a_cpu_leaves_the_borders_of_blocks_from_gpus_and_says_so(two_blocks, caplog):
     """Refining would take hours where a login node without a GPU merges."""
-    out, plan = trained
+    out, plan = two_blocks(20)
     folder = RunWriter(folder_of(out, plan, 0))
     summary = folder.read_summary()
     folder.write_summary(summary | {"peak_gpu_memory_bytes": 10**9})

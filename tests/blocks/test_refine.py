@@ -1,7 +1,6 @@
 """Refining borders: what is trained, what stays, and what it gains."""
 
 import numpy as np
-import pytest
 import torch
 
 from sehdr_warp.blocks.job import folder_of
@@ -10,16 +9,6 @@ from sehdr_warp.blocks.seams import measure_seams
 from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
 from sehdr_warp.runs.open import load_scene_and_log_notes
 from sehdr_warp.runs.run import load_run
-
-from .two_blocks import train_two_blocks
-
-
-@pytest.fixture(scope="module")
-def town(tmp_path_factory):
-    """A run folder with two blocks of few steps, and their plan."""
-    folder = tmp_path_factory.mktemp("town")
-    plan = train_two_blocks(folder, iterations=150)
-    return folder / "run", plan
 
 
 def merged_rows(out, plan):
@@ -38,8 +27,8 @@ def merged_rows(out, plan):
     return {name: torch.cat([rows[name] for rows in parts]) for name in PARAMETER_NAMES}, torch.cat(owners)
 
 
-def test_only_gaussians_near_borders_change_and_the_border_gets_better(town):
-    out, plan = town
+def test_only_gaussians_near_borders_change_and_the_border_gets_better(two_blocks):
+    out, plan = two_blocks(150)
     before, blocks = merged_rows(out, plan)
     after = {name: values.clone() for name, values in before.items()}
     refine_borders(after, blocks, out, plan, torch.device("cpu"), "auto")
@@ -61,9 +50,9 @@ def test_only_gaussians_near_borders_change_and_the_border_gets_better(town):
     assert errors[1] > errors[0] + 0.2
 
 
-def test_the_rows_around_trained_gaussians_are_rendered_and_stay(town):
+def test_the_rows_around_trained_gaussians_are_rendered_and_stay(two_blocks):
     """They hide what is behind them, and Adam has no moments for them."""
-    out, plan = town
+    out, plan = two_blocks(150)
     tensors, blocks = merged_rows(out, plan)
     gaussians = Gaussians(**{name: values[blocks == 0] for name, values in tensors.items()})
     gaussians.surround({name: values[blocks == 1] for name, values in tensors.items()})

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.survey import write_survey
 from sehdr_warp.blocks.block_plan import BlockPlan
 from sehdr_warp.blocks.job import folder_of
 from sehdr_warp.runs.run import load_run
@@ -35,7 +34,7 @@ export SLURM_JOB_ID=$1 SLURM_NTASKS=1 SLURM_JOB_NUM_NODES=1 SLURM_NODEID=0 SLURM
 export SLURM_JOB_NODELIST=node7
 echo RUNNING > "$CLUSTER/$1.state"
 bash "$CLUSTER/$1.sh" && echo COMPLETED > "$CLUSTER/$1.state" || echo FAILED > "$CLUSTER/$1.state"
-[ -e "$CLUSTER/$1.requeue" ] && rm "$CLUSTER/$1.requeue" && exec start_job $1
+[ -e "$CLUSTER/$1.requeue" ] && mv "$CLUSTER/$1.requeue" "$CLUSTER/$1.requeued" && exec start_job $1
 """
 SRUN = """#!/bin/bash
 while [[ $1 == --* ]]; do
@@ -90,14 +89,9 @@ def cluster(tmp_path, monkeypatch):
     return jobs
 
 
-@pytest.fixture
-def survey(tmp_path):
-    write_survey(tmp_path / "town", views=32, size=48, gaussians=6000)
-    return tmp_path / "town"
-
-
-def send_once(out, number):
-    """Send a signal to a block's process when both blocks have written a checkpoint of their training."""
+def send(out, *numbers):
+    """Send each signal to the process of another block when both have written a checkpoint of their training."""
+    numbers = list(numbers)
     deadline = time.monotonic() + 90
     while time.monotonic() < deadline:
         begun = {path.parents[1] for path in out.glob("blocks/block_*/checkpoints/iteration_*[1-9]*")}
@@ -105,21 +99,22 @@ def send_once(out, number):
             with suppress(OSError):
                 words = (place / "cmdline").read_text()
                 if "submitit.core._submit" in words and str(out) in words:
-                    os.kill(int(place.name), number)
-                    return
+                    os.kill(int(place.name), numbers.pop())
+                    if not numbers:
+                        return
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("number", [signal.SIGUSR2, signal.SIGTERM], ids=["time limit", "preempted"])
-def test_a_job_that_is_ended_goes_on_and_the_blocks_are_merged(cluster, survey, tmp_path, number):
+def test_jobs_that_are_ended_go_on_and_the_blocks_are_merged(cluster, survey, tmp_path):
+    """SIGUSR2 announces the time limit, SIGTERM that another job takes the node."""
     out = tmp_path / "run"
-    sender = threading.Thread(target=send_once, args=(out, number))
+    sender = threading.Thread(target=send, args=(out, signal.SIGUSR2, signal.SIGTERM))
     sender.start()
     words = ["--schedule.checkpoint-every", "3000", "--slurm", "partition=gpu,time=9,mem=4GB"]
     assert call("train", survey, "--out", out, *[*FLAGS, *words]) == 0
     sender.join()
     scripts = [script.read_text() for script in sorted(cluster.glob("*.sh"))]
-    assert len(scripts) == (2 if number == signal.SIGUSR2 else 3), "one is requeued by SLURM, or submitted again"
+    assert len(scripts) == 3 and len(list(cluster.glob("*.requeued"))) == 1, "SLURM requeues one, the other is new"
     for flag in ("--partition=gpu", "--time=9", "--mem=4GB", "--job-name=sehdr-warp"):
         assert all(f"#SBATCH {flag}\n" in script for script in scripts)
     plan = BlockPlan.read(out)
@@ -151,7 +146,7 @@ def test_a_killed_job_is_noticed_without_accounts(cluster, survey, tmp_path, mon
     sacct.write_text("#!/bin/bash\necho 'Slurm accounting storage is disabled' >&2\nexit 1\n")
     monkeypatch.setattr(slurm_states, "LOOK_EVERY", 1.0)
     out = tmp_path / "run"
-    sender = threading.Thread(target=send_once, args=(out, signal.SIGKILL))
+    sender = threading.Thread(target=send, args=(out, signal.SIGKILL))
     sender.start()
     words = ["--schedule.checkpoint-every", "3000", "--slurm", "partition=gpu,time=9"]
     assert call("train", survey, "--out", out, *[*FLAGS, *words]) == 0

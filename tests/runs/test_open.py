@@ -51,17 +51,30 @@ def test_photos_of_a_folder_and_of_a_video_are_loaded_again(monkeypatch, tmp_pat
 TRAIN = "--preset demo --max-size 40 --response srgb --device cpu --mcmc.seed-fraction 0 --model.initial-density 0"
 
 
-@pytest.fixture
-def bare_run(monkeypatch, tmp_path):
-    """Photos without poses, and a run of them that ended after 20 of 40 steps."""
-    folder = tmp_path / "photos"
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder `place` with photos without poses and a run of them that ended after 20 of 40 steps, and its copy."""
+    place = tmp_path_factory.mktemp("bare") / "place"
+    place.mkdir()
     views = load_scene("embedded", max_size=48, response="srgb").views[:10]
-    cameras = write_bare_photos(folder, views)
+    cameras = write_bare_photos(place / "photos", views)
     del cameras[views[-1].name]
-    shutil.copy(folder / f"{views[0].name}.png", tmp_path / "other.png")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        find_cameras(monkeypatch, cameras)
+        assert call("train", place / "photos", "--out", place / "run", *TRAIN.split(), "--iterations", 20) == 0
+    shutil.copytree(place, place.with_name("copy"))
+    return place, cameras
+
+
+@pytest.fixture
+def bare_run(trained, monkeypatch, tmp_path):
+    """The photos and the run as they were, at the place that the run names, and the cameras of the photos."""
+    place, cameras = trained
+    shutil.rmtree(place)
+    shutil.copytree(place.with_name("copy"), place)
+    shutil.copy(place / "photos" / f"{min(cameras)}.png", tmp_path / "other.png")
     find_cameras(monkeypatch, cameras)
-    assert call("train", folder, "--out", tmp_path / "run", *TRAIN.split(), "--iterations", 20) == 0
-    return folder, tmp_path / "run", cameras
+    return place / "photos", place / "run", cameras
 
 
 def figures(run, file):

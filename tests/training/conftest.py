@@ -8,6 +8,7 @@ import pytest
 
 from sehdr_warp.training.train import create_trainer
 
+from ..make_scenes import write_blender
 from .toy import VARIANTS, toy_scene, without_truth
 
 
@@ -19,6 +20,14 @@ def quickly(few_probes):
 @pytest.fixture(scope="session")
 def scene():
     return toy_scene()
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory):
+    """The folder of six photos of 40 x 30 pixels, with poses; not to be changed."""
+    folder = tmp_path_factory.mktemp("photos")
+    write_blender(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

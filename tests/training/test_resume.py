@@ -16,7 +16,7 @@ from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
-from sehdr_warp.scene import load_scene, response_choice
+from sehdr_warp.scene import response_choice
 from sehdr_warp.training.run_output import remove_unseen
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
@@ -194,9 +194,8 @@ def test_resuming_with_the_same_config_keeps_the_planned_length(scene, tmp_path)
 
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
-def test_a_preset_does_not_stretch_a_run_of_fewer_iterations(preset, tmp_path):
-    flags = "--max-size 32 --device cpu --response hdr-nerf --preset"
-    words = ["train", "embedded", *flags.split(), preset, "--out", tmp_path / "run"]
+def test_a_preset_does_not_stretch_a_run_of_fewer_iterations(preset, photos, tmp_path):
+    words = ["train", photos, "--device", "cpu", "--response", "srgb", "--preset", preset, "--out", tmp_path / "run"]
     assert call(*words, "--iterations", 3) == 0
     assert call(*words, "--resume") == 0
     assert RunFolder(tmp_path / "run").read_config().schedule.iterations == 3
@@ -204,8 +203,7 @@ def test_a_preset_does_not_stretch_a_run_of_fewer_iterations(preset, tmp_path):
     assert RunFolder(tmp_path / "run").read_config().schedule.iterations == 4
 
 
-def test_a_preset_in_python_does_not_stretch_a_run_and_stated_iterations_do(tmp_path, logged):
-    scene = load_scene("embedded", max_size=32, response="hdr-nerf")
+def test_a_preset_in_python_does_not_stretch_a_run_and_stated_iterations_do(scene, tmp_path, logged):
     train(scene, tmp_path / "run", load_config("fast", {"schedule.iterations": 3}), device="cpu")
     file = tmp_path / "fast.toml"
     file.write_text('base = "fast"\n')
@@ -258,8 +256,8 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
             use(run.path)
 
 
-def test_resume_refuses_another_response(tmp_path, capsys):
-    words = ["train", "embedded", "--out", str(tmp_path / "run"), "--max-size", "32", "--device", "cpu"]
+def test_resume_refuses_another_response(photos, tmp_path, capsys):
+    words = ["train", photos, "--out", tmp_path / "run", "--device", "cpu"]
     assert call(*words, "--iterations", "1", "--response", "learned") == 0
     assert call("train", "--resume", "--out", tmp_path / "run", "--device", "cpu", "--response", "srgb") == 1
     assert "response.name = 'learned', but 'srgb' was asked for" in capsys.readouterr().err
@@ -277,8 +275,8 @@ def test_a_summary_is_of_the_last_checkpoint(scene, tmp_path):
     assert not trainer.train().summary()["finished"]
 
 
-def test_a_resumed_training_takes_the_runs_response(tmp_path, monkeypatch):
-    words = ["train", "embedded", "--out", str(tmp_path / "run"), "--max-size", "32", "--device", "cpu"]
+def test_a_resumed_training_takes_the_runs_response(photos, tmp_path, monkeypatch):
+    words = ["train", photos, "--out", tmp_path / "run", "--device", "cpu"]
     assert call(*words, "--iterations", "4") == 0
     monkeypatch.setattr(response_choice, "_select_for_dataset", None)
     assert call("train", "--resume", "--out", tmp_path / "run", "--device", "cpu", "--iterations", "6") == 0

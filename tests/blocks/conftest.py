@@ -1,0 +1,67 @@
+"""A town as survey photos, and as two trained blocks, for all tests of blocks."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from benchmarks.survey import write_survey
+from sehdr_warp.blocks import jobs
+from sehdr_warp.blocks.block_plan import make_block_plan
+from sehdr_warp.blocks.job import train_block
+from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.training.launch import installed_versions
+
+LITTLE = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_prior": False}
+
+
+@pytest.fixture(scope="session")
+def survey(tmp_path_factory):
+    """The folder of 32 photos of a town; not to be changed."""
+    folder = tmp_path_factory.mktemp("survey") / "town"
+    write_survey(folder, views=32, size=48, gaussians=6000)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def divide():
+    """Return a function that divides photos for a training of few steps into two blocks, and writes their plan."""
+
+    def divide(photos, out, iterations):
+        data = {"path": str(photos), "exposure_index": None, "max_size": None, "holdout": None}
+        fields = {"response.name": "srgb", "schedule.iterations": iterations}
+        plan = make_block_plan(data, override_config(Config(), fields | LITTLE), torch.device("cpu"), 2)
+        assert plan is not None
+        out.mkdir()
+        plan.write(out)
+        return plan
+
+    return divide
+
+
+@pytest.fixture(scope="session")
+def two_blocks(survey, divide, tmp_path_factory):
+    """Return a function that trains two blocks and returns their folder and plan; what changes them restores them."""
+
+    @cache
+    def train(iterations):
+        out = tmp_path_factory.mktemp("trained") / "run"
+        plan = divide(survey, out, iterations)
+        for index in (0, 1):
+            assert train_block(out, index, "cpu", "auto", installed_versions()).error is None
+        return out, plan
+
+    return train
+
+
+@pytest.fixture
+def jobs_here(monkeypatch):
+    """Jobs of this machine run one after the other in this process, whose libraries are loaded."""
+
+    def submit(job, *arguments):
+        result = job(*arguments)
+        return SimpleNamespace(done=lambda: True, exception=lambda: None, result=lambda: result)
+
+    monkeypatch.setattr(jobs, "local_executors", lambda _, slots, __: [SimpleNamespace(submit=submit)] * slots)
