@@ -248,7 +248,8 @@ def test_sets(space, place, value, codes):
         at = at[key]
     at[place[-1]] = value
     put(space / "photos" / "transforms.json", tree)
-    either = place[0] == "w" or place[-1] == "transform_matrix" or str(value).startswith(("http", "/"))  # Left out
+    left_out = place[-1] == "transform_matrix" or str(value).startswith(("http", "/", ".."))
+    either = left_out or place[0] == "w"
     tried(space, SHORT, EITHER if either else codes)
 
 
