@@ -77,6 +77,11 @@ class Lens:
             raise InputError(self.source, problem, remedy)
 
     @property
+    def focal_count(self) -> int:
+        """Number of focal lengths in front of the principal point in params."""
+        return 1 if self.model in _ONE_FOCAL else 2
+
+    @property
     def focal(self) -> tuple[float, float]:
         """Focal lengths (fx, fy) in pixels; of a panorama pixels per radian."""
         if self.model == _SPHERE:
@@ -88,8 +93,7 @@ class Lens:
         """Principal point (cx, cy) in pixels."""
         if self.model == _SPHERE:
             return self.width / 2, self.height / 2
-        first = 1 if self.model in _ONE_FOCAL else 2
-        return self.params[first], self.params[first + 1]
+        return self.params[self.focal_count], self.params[self.focal_count + 1]
 
     @property
     def projection(self) -> str:
@@ -105,15 +109,14 @@ class Lens:
 
     @property
     def _distortion(self) -> tuple[float, ...]:
-        return tuple(self.params[3 if self.model in _ONE_FOCAL else 4 :])
+        return tuple(self.params[self.focal_count + 2 :])
 
     @property
     def is_pinhole(self) -> bool:
         """True if the photos need no undistortion."""
         if self.projection != "pinhole":
             return True
-        first = 3 if self.model in _ONE_FOCAL else 4
-        return self.model in _NEUTRAL_AT_ZERO and not any(self.params[first:])
+        return self.model in _NEUTRAL_AT_ZERO and not any(self._distortion)
 
     def resized(self, width: int, height: int) -> "Lens":
         """Return the same lens for images of another size; distortion parameters do not depend on it."""

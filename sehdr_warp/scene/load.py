@@ -18,6 +18,7 @@ from .file_names import image_folder, unique_names
 from .float_photos import with_float_times
 from .masks import assign_masks
 from .photos import usable_photos
+from .pose_conventions import POSED, with_fitting_cameras
 from .preprocess import preprocess
 from .readers.bare_photos import find_photos, inner_folder, place_photos, with_cameras
 from .readers.colmap import model_fits, read_colmap
@@ -172,10 +173,8 @@ def parse_dataset(
             records, times_known, time_notes = with_times(untimed, folder)
             dataset = replace(dataset, times_known=times_known)
     pose_notes: list[str] = []
-    if dataset.format == "transforms" and not len(dataset.cloud.positions):  # Points would show wrong poses.
-        from .pose_conventions import with_fitting_poses
-
-        records, pose_notes = with_fitting_poses(records)
+    if dataset.format in POSED:
+        records, pose_notes = with_fitting_cameras(records, dataset.format, cache)
     records, camera_notes = check_cameras(records, dataset.cloud)
     records, split_notes = _with_splits(records, dataset, holdout)
     training = sum(record.split == "train" for record in records)

@@ -1,136 +1,214 @@
-"""Check of stated poses against the photos: pixels that two photos share must fit their cameras.
+"""Check of stated cameras against the photos: pixels that two photos share must fit their poses and lenses.
 
-transforms.json has OpenGL's axes by convention, but scripts also write OpenCV's, or world-to-camera matrices. Nothing
-in the file tells them apart, and a training on wrong poses fails without an error.
+Scripts and exports mix up axes, camera-to-world and world-to-camera, positions and translations, sizes of photos, and
+photos with and without distortion. Nothing in their files tells these apart, and a training on wrong cameras fails
+without an error.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import cache
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
-from ..errors import InputError
+from .cached_folder import cached_folder, file_digest
 from .dataparser import ImageRecord
-from .images.ldr_files import PILLOW_ERRORS, open_image
-from .lens import Lens, Undistortion
-from .sfm.reconstruction import quiet_colmap
+from .lens import Lens
+from .shared_pixels import SharedPixels, candidate_pairs, shared_pixels
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # Between the axes of OpenGL (y up, z back) and OpenCV (y down, z ahead)
-_READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "as camera-to-world in OpenCV's axes": lambda pose: _FLIP @ pose,
-    "as world-to-camera in OpenCV's axes": lambda pose: np.linalg.inv(pose) @ _FLIP,
-    "as world-to-camera in OpenGL's axes": lambda pose: _FLIP @ np.linalg.inv(pose) @ _FLIP,
+POSED = ("transforms", "colmap", "llff", "opensfm")
+"""Layouts whose cameras are checked."""
+_VERSION = 1  # Raised with every change of results
+_AXES = {  # From a camera's axes to OpenCV's: x right, y down, z ahead
+    "OpenCV's": np.eye(3),
+    "OpenGL's": np.diag([1.0, -1.0, -1.0]),
+    "LLFF's": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+    "upside-down": np.diag([-1.0, -1.0, 1.0]),
 }
-"""World-to-camera matrices, by what the file holds, of one that was read as camera-to-world in OpenGL's axes."""
-_SIDE = 800  # Pixels of the longest side that are compared
-_MOST_PAIRS, _FEWEST_PAIRS, _SURE_PAIRS = 8, 4, 3  # That are compared, that show poses to be wrong, and right
-_FEWEST_MATCHES, _RATIO = 30, 0.75  # Of a pair; a match's distance as part of that of the second best
-_FITS, _MISSES = 1.5, 6.0  # Pixels: sound poses have 0.1 to 0.6, other axes 3 to 130
+_FILE_AXES = {"transforms": "OpenGL's", "llff": "LLFF's"}  # In which camera-to-world is stated; others: world-to-camera
+_SURE_PAIRS, _FEWEST_PAIRS, _MOST_PAIRS = 3, 4, 8  # That show cameras to be right, and wrong; that are compared
+_FITS, _MISSES = 1.2, 4.0  # Pixels of a photo of shared_pixels.SIDE: sound cameras have 0.1 to 0.6, other axes 3 to 100
+_EXACT = 0.6  # Pixels from which on the lens is doubted: a focal length that is 10 % off has 0.4 to 2.5
 _LEAST_SHARE = 0.75  # Of the pairs, which another reading must fit
+_LEAST_GAIN = 2.0  # By which another lens must fit better
+_FOCAL_LENGTHS = np.geomspace(0.3, 3.3, 61)  # In parts of the stated one
+_LEAST_CHANGE = 0.05  # Of the focal length
+_OFF_CENTER = 0.1  # Part of a photo's size by which a principal point of another size lies beside the middle
 
 
-def with_fitting_poses(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[str]]:
-    """Return photos with poses by the reading that fits neighboring photos, and a note if it is not OpenGL's.
+@dataclass(frozen=True)
+class _Verdict:
+    """How cameras are read: the names of a reading of poses and of what the lens lacks, and a note."""
 
-    Few photos are read: three pairs that fit end the check.
+    reading: str | None = None
+    focal: float = 1.0  # Times the stated focal length
+    whole: bool = False  # The principal point, too
+    distorted: bool = True
+    note: str | None = None
+
+    @property
+    def as_stated(self) -> bool:
+        """True if the lens is read as the file states it."""
+        return self.focal == 1 and self.distorted
+
+
+def with_fitting_cameras(
+    records: Sequence[ImageRecord], layout: str, cache: Path | str | None = None
+) -> tuple[list[ImageRecord], list[str]]:
+    """Return photos with poses and lenses by the reading that fits pairs of photos, and a note if it is not the usual.
+
+    Few photos are read: three pairs that fit end the check. The result is cached, as cached_folder() does.
     """
-    try:
-        with quiet_colmap():
-            from pycolmap import Bitmap, Device, FeatureExtractionOptions, FeatureExtractor
+    pairs = candidate_pairs(records)
+    used = [records[i] for i in sorted({i for pair in pairs for i in pair})]
+    if any(record.derived or not record.image.is_file() for record in used):
+        return list(records), []
+    facts = [
+        (file_digest(record.image), record.lens.model, record.lens.params, record.world_to_camera.tolist(), layout)
+        for record in used
+    ]
+    key = hashlib.sha256(json.dumps([_VERSION, pairs, facts]).encode()).hexdigest()[:16]
 
-            options = FeatureExtractionOptions()
-            options.sift.max_num_features, options.sift.first_octave = 2000, 0  # A photo is not enlarged to find more.
-            extractor = FeatureExtractor.create(options, Device.cpu)
+    def fill(result: Path) -> None:
+        (result / "verdict.json").write_text(json.dumps(asdict(_verdict(records, layout, pairs))))
+
+    try:
+        place = cached_folder(cache, f"poses-{key}", fill)
     except ImportError:
         return list(records), ["poses: not compared with the photos, because pycolmap is not installed"]
-    undistortion = cache(Undistortion)
+    verdict = _Verdict(**json.loads((place / "verdict.json").read_text()))
+    return [_read(record, layout, verdict) for record in records], [verdict.note] if verdict.note else []
 
-    def extract(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        points, descriptors = extractor.extract(Bitmap.from_array(grey))
-        return np.array([(point.x, point.y) for point in points]).reshape(-1, 2), descriptors.data
 
-    @cache
-    def features(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        return _features(records[index], extract, undistortion)
+def _read(record: ImageRecord, layout: str, verdict: _Verdict) -> ImageRecord:
+    """Return a photo with the pose and the lens of a verdict."""
+    pose, lens = record.world_to_camera, record.lens
+    if verdict.reading is not None:
+        pose = dict(_readings(layout))[verdict.reading](pose)
+    return replace(record, world_to_camera=pose, lens=_lens(lens, verdict))
 
+
+def _lens(lens: Lens, verdict: _Verdict) -> Lens:
+    """Return a lens as a verdict reads it."""
+    if verdict.as_stated or lens.projection != "pinhole":
+        return lens
+    params, count = list(lens.params), lens.focal_count
+    changed = count + 2 * verdict.whole
+    params[:changed] = [verdict.focal * value for value in params[:changed]]
+    if not verdict.distorted:
+        params[count + 2 :] = [0.0] * len(params[count + 2 :])
+    return replace(lens, params=tuple(params))
+
+
+def _readings(layout: str) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
+    """Yield readings of what a file states, by name: from the pose that was read to the pose that is meant."""
+    stated = _FILE_AXES.get(layout)
+
+    def in_file(pose: np.ndarray) -> np.ndarray:
+        if stated is None:
+            return pose
+        return np.linalg.inv(pose) @ _pose(_AXES[stated], np.zeros(3))
+
+    for name, axes in _AXES.items():
+        kinds = {
+            f"as camera-to-world in {name} axes": lambda file, axes=axes: _pose(
+                axes @ file[:3, :3].T, -axes @ file[:3, :3].T @ file[:3, 3]
+            ),
+            f"as world-to-camera in {name} axes": lambda file, axes=axes: _pose(
+                axes @ file[:3, :3], axes @ file[:3, 3]
+            ),
+            f"as rotations world-to-camera with the cameras' positions, in {name} axes": lambda file, axes=axes: _pose(
+                axes @ file[:3, :3], -axes @ file[:3, :3] @ file[:3, 3]
+            ),
+            f"as rotations camera-to-world with translations world-to-camera, in {name} axes": (
+                lambda file, axes=axes: _pose(axes @ file[:3, :3].T, axes @ file[:3, 3])
+            ),
+        }
+        for kind, read in kinds.items():
+            yield kind, lambda pose, read=read: read(in_file(pose))
+    if layout == "colmap":
+        yield "with quaternions in the order x, y, z, w", _with_quaternion_last
+
+
+def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    return pose
+
+
+def _with_quaternion_last(pose: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return _pose(Rotation.from_quat([w, x, y, z]).as_matrix(), pose[:3, 3])
+
+
+def _verdict(records: Sequence[ImageRecord], layout: str, pairs: Sequence[tuple[int, int]]) -> _Verdict:
+    shared: list[SharedPixels] = []
     stated: list[float] = []
-    others: dict[str, list[float]] = {reading: [] for reading in _READINGS}
-    for i in range(0, len(records) - 1, max(1, (len(records) - 1) // _MOST_PAIRS)):
-        first, second = features(i), features(i + 1)
-        if first is None or second is None or (places := _matches(first, second)) is None:
-            continue
-        poses = records[i].world_to_camera, records[i + 1].world_to_camera
-        stated.append(_distance(places, *poses))
-        for reading, read in _READINGS.items():
-            others[reading].append(_distance(places, read(poses[0]), read(poses[1])))
-        if sum(distance < _FITS for distance in stated) >= _SURE_PAIRS:
-            return list(records), []
-    if len(stated) < _FEWEST_PAIRS or np.median(stated) < _MISSES:
-        return list(records), []
-    best = min(others, key=lambda reading: float(np.median(others[reading])))
-    miss = f"pixels that two photos share lie {np.median(stated):.0f} pixels beside where they must be"
-    if np.mean(np.array(others[best]) < _FITS) < _LEAST_SHARE:
-        remedy = "to find the cameras anew, give a folder with the photos alone"
-        return list(records), [f"poses: they do not fit the photos, by no convention: {miss}; {remedy}"]
-    fitting = [replace(record, world_to_camera=_READINGS[best](record.world_to_camera)) for record in records]
-    fit = f"which fits the photos ({np.median(others[best]):.1f} pixels)"
-    return fitting, [f"poses: {miss} by the convention of transforms.json; they are read {best} instead, {fit}"]
+    for each in shared_pixels(records, pairs):
+        shared.append(each)
+        stated += _distances(records, [each])
+        fitting = sorted(stated)[:_SURE_PAIRS]
+        if len(fitting) == _SURE_PAIRS and fitting[-1] < _FITS and np.median(stated) < _EXACT:
+            return _Verdict()
+        if len(shared) == _MOST_PAIRS:
+            break
+    miss = float(np.median(stated)) if stated else 0.0
+    if len(stated) < _FEWEST_PAIRS or miss < _EXACT:
+        return _Verdict()
+    file = records[0].lens.source.name
+    far = f"pixels that two photos share lie {miss:.1f} pixels beside where {file} puts them"
+    if miss == np.inf:
+        far = f"{file} puts points that two photos share behind the cameras"
+    lens, found = _best_lens(records, shared)
+    if not lens.as_stated and np.median(found) * _LEAST_GAIN < miss and _fit(found):
+        first = records[0].lens
+        other = f"a focal length of {lens.focal * first.focal[0]:.0f} in place of {first.focal[0]:.0f} pixels"
+        what = " and ".join([other] * (lens.focal != 1) + ["no distortion"] * (not lens.distorted))
+        fit = f"which fits the photos ({np.median(found):.1f} pixels)"
+        return replace(lens, note=f"lens: {far}; it is read with {what}, {fit}")
+    if miss < _MISSES:
+        return _Verdict()
+    readings = {name: _distances(records, shared, read) for name, read in _readings(layout)}
+    reading = min(readings, key=lambda name: float(np.median(readings[name])))
+    if _fit(readings[reading]):
+        fit = f"which fits the photos ({np.median(readings[reading]):.1f} pixels)"
+        return _Verdict(reading, note=f"poses: {far}; they are read {reading} instead, {fit}")
+    remedy = "to find the cameras anew, give a folder with the photos alone"
+    return _Verdict(note=f"poses: {file} does not fit the photos, by no convention: {far}; {remedy}")
 
 
-def _features(
-    record: ImageRecord,
-    extract: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    undistortion: Callable[[Lens], Undistortion],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return rays [m, 3] and descriptors [m, 128] of a photo, and pixels per unit; None for one that cannot serve."""
-    lens = record.lens
-    if lens.projection != "pinhole":
-        return None
-    scale = min(1.0, _SIDE / max(lens.width, lens.height))
-    size = max(1, round(lens.width * scale)), max(1, round(lens.height * scale))
-    try:
-        with open_image(record.image) as image:
-            if image.mode not in ("L", "RGB", "RGBA", "P") or (image.width > image.height) != (size[0] > size[1]):
-                return None
-            image.draft("L", size)
-            grey = np.asarray(image.convert("RGB").convert("L").resize(size, Image.Resampling.BOX))
-        unbent = undistortion(lens.resized(*size))
-        grey = np.rint(unbent.apply(np.repeat(grey[..., None], 3, -1).astype(np.float32)))[..., 0]
-    except (InputError, *PILLOW_ERRORS):
-        return None
-    places, descriptors = extract(np.ascontiguousarray(np.clip(grey, 0, 255).astype(np.uint8)))
-    camera = unbent.camera(record.world_to_camera)
-    x, y = (places[:, 0] - camera.cx) / camera.fx, (places[:, 1] - camera.cy) / camera.fy
-    rays = np.stack([x, y, np.ones_like(x)], -1).astype(np.float64)
-    descriptors = descriptors.astype(np.float32)
-    return rays, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True).clip(1e-6), np.array(camera.fx)
+def _fit(distances: Sequence[float]) -> bool:
+    return float(np.mean(np.array(distances) < _FITS)) >= _LEAST_SHARE
 
 
-def _matches(
-    first: tuple[np.ndarray, np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return the rays [k, 3] in both photos of what they share, and pixels per unit; None if it is too little."""
-    if min(len(first[0]), len(second[0])) < _FEWEST_MATCHES:
-        return None
-    distances = np.sqrt(np.clip(2 - 2 * first[1] @ second[1].T, 0, None))
-    nearest = distances.argpartition(1, axis=1)[:, :2]
-    pair = np.take_along_axis(distances, nearest, 1)
-    nearest = np.take_along_axis(nearest, pair.argsort(1), 1)
-    pair.sort(1)
-    clear = (pair[:, 0] < _RATIO * pair[:, 1]) & (distances.argmin(0)[nearest[:, 0]] == np.arange(len(distances)))
-    if clear.sum() < _FEWEST_MATCHES:
-        return None
-    return first[0][clear], second[0][nearest[clear, 0]], float(first[2])
+def _best_lens(records: Sequence[ImageRecord], shared: Sequence[SharedPixels]) -> tuple[_Verdict, list[float]]:
+    """Return the reading of the lens that fits best, and its distances."""
+    lens, best = records[0].lens, (_Verdict(), _distances(records, shared))
+    off_center = max(abs(lens.centre[0] / lens.width - 0.5), abs(lens.centre[1] / lens.height - 0.5)) > _OFF_CENTER
+    for whole in (False, True)[: 1 + off_center]:
+        for distorted in (True, False)[: 2 - lens.is_pinhole]:
+            for focal in (1.0, *_FOCAL_LENGTHS):
+                if not 0 < abs(focal - 1) < _LEAST_CHANGE:
+                    verdict = _Verdict(focal=float(focal), whole=whole, distorted=distorted)
+                    found = _distances(records, shared, verdict=verdict)
+                    best = min(best, (verdict, found), key=lambda each: float(np.median(each[1])))
+    return best
 
 
-def _distance(places: tuple[np.ndarray, np.ndarray, float], first: np.ndarray, second: np.ndarray) -> float:
-    """Return the median distance in pixels (Sampson's) of shared pixels from the epipolar lines of two poses."""
-    rays, other_rays, focal = places
-    between = second @ np.linalg.inv(first)
-    x, y, z = between[:3, 3] / max(float(np.linalg.norm(between[:3, 3])), 1e-300)
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ between[:3, :3]
-    lines, other_lines = rays @ essential.T, other_rays @ essential
-    slopes = (lines[:, :2] ** 2).sum(1) + (other_lines[:, :2] ** 2).sum(1)
-    return float(np.median(focal * np.abs((other_rays * lines).sum(1)) / np.sqrt(np.maximum(slopes, 1e-300))))
+def _distances(
+    records: Sequence[ImageRecord],
+    shared: Sequence[SharedPixels],
+    read: Callable[[np.ndarray], np.ndarray] = lambda pose: pose,
+    verdict: _Verdict = _Verdict(),
+) -> list[float]:
+    """Return the distances of shared pixels from the epipolar lines, of a reading of poses and lenses."""
+    return [
+        each.distance(
+            [_lens(lens, verdict) for lens in each.lenses], *(read(records[i].world_to_camera) for i in each.indices)
+        )
+        for each in shared
+    ]

@@ -1,34 +1,96 @@
-"""Poses that a file states by another convention than the photos show."""
+"""Cameras that a file states by another convention than the photos show."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.load import parse_dataset
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+LARGER = 2  # Times the embedded photos, in which few features are found
 
 
 @pytest.fixture(scope="module")
 def views():
-    return [view for view in load_scene("embedded").views if view.split == "train"]
+    return [view for view in load_scene("embedded", response="hdr-nerf").views if view.split == "train"][:14]
 
 
-def write(folder, views, matrix_of):
-    """Write transforms.json without points, in which matrix_of(world_to_camera) stands for each photo's pose."""
-    frames = []
+@pytest.fixture(scope="module")
+def photos(views, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
     for i, view in enumerate(views):
-        size = [4 * side for side in view.codes.shape[1::-1]]
         codes = np.round(view.image * 255).astype(np.uint8)
+        size = [LARGER * side for side in codes.shape[1::-1]]
         Image.fromarray(codes).resize(size, Image.Resampling.BICUBIC).save(folder / f"{i:02}.png")
-        frames.append({"file_path": f"{i:02}.png", "transform_matrix": matrix_of(view.camera.world_to_camera).tolist()})
-    camera = views[0].camera
-    values = {"fl_x": 4 * camera.fx, "fl_y": 4 * camera.fy, "w": size[0], "h": size[1], "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(values))
     return folder
+
+
+def link(photos, folder):
+    folder.mkdir(exist_ok=True)
+    for photo in photos.iterdir():
+        (folder / photo.name).hardlink_to(photo)
+
+
+def write_transforms(folder, photos, views, matrix_of, **lens):
+    """Write transforms.json in which matrix_of(world_to_camera) stands for each photo's pose."""
+    link(photos, folder)
+    camera = views[0].camera
+    values = {"fl_x": LARGER * camera.fx, "w": LARGER * camera.width, "h": LARGER * camera.height}
+    frames = [
+        {"file_path": f"{i:02}.png", "transform_matrix": matrix_of(view.camera.world_to_camera).tolist()}
+        for i, view in enumerate(views)
+    ]
+    (folder / "transforms.json").write_text(json.dumps({**values, **lens, "frames": frames}))
+    return folder
+
+
+def write_llff(folder, photos, views, axes):
+    """Write poses_bounds.npy of camera-to-world matrices whose columns are some axes of OpenCV's camera."""
+    link(photos, folder / "images")
+    rows = []
+    for view in views:
+        camera, pose = view.camera, np.linalg.inv(view.camera.world_to_camera)[:3]
+        size = LARGER * np.array([[camera.height], [camera.width], [camera.fx]])
+        rows.append([*np.hstack([pose[:, :3] @ axes, pose[:, 3:], size]).ravel(), 1.0, 9.0])
+    np.save(folder / "poses_bounds.npy", rows)
+    return folder
+
+
+def write_colmap(folder, photos, views, pose_of):
+    """Write a COLMAP model in which pose_of(world_to_camera) is a quaternion and a translation, with points."""
+    link(photos, folder / "images")
+    (folder / "sparse").mkdir()
+    camera = views[0].camera
+    numbers = (LARGER * value for value in (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy))
+    (folder / "sparse/cameras.txt").write_text("1 PINHOLE {} {} {} {} {} {}\n".format(*numbers))
+    lines = [
+        f"{i + 1} {' '.join(map(str, np.concatenate(pose_of(view.camera.world_to_camera))))} 1 {i:02}.png\n\n"
+        for i, view in enumerate(views)
+    ]
+    (folder / "sparse/images.txt").write_text("".join(lines))
+    (folder / "sparse/points3D.txt").write_text("1 0 0 0 9 9 9 0\n2 1 1 1 9 9 9 0\n")
+    return folder
+
+
+def quaternion(pose):
+    return np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
+
+
+def check(folder, views, words):
+    dataset = parse_dataset(folder, holdout=0)
+    for record, view in zip(dataset.records, views, strict=True):
+        # A world may be turned as a whole; between cameras nothing may differ.
+        between = record.world_to_camera @ np.linalg.inv(dataset.records[0].world_to_camera)
+        right = view.camera.world_to_camera @ np.linalg.inv(views[0].camera.world_to_camera)
+        np.testing.assert_allclose(between, right, atol=1e-6)
+    notes = [note for note in dataset.notes if note.startswith(("poses: ", "lens: "))]
+    assert [words in note for note in notes] == [True] * (words is not None)
+    return dataset
 
 
 @pytest.mark.parametrize(
@@ -36,21 +98,71 @@ def write(folder, views, matrix_of):
     [
         (lambda pose: np.linalg.inv(pose) @ FLIP, None),
         (np.linalg.inv, "read as camera-to-world in OpenCV's axes instead"),
-        (lambda pose: pose, "read as world-to-camera in OpenCV's axes instead"),
         (lambda pose: FLIP @ pose, "read as world-to-camera in OpenGL's axes instead"),
     ],
 )
-def test_poses_are_read_as_they_fit_the_photos(tmp_path, views, matrix_of, words):
-    dataset = parse_dataset(write(tmp_path, views, matrix_of), holdout=0)
-    for record, view in zip(dataset.records, views, strict=True):
-        np.testing.assert_allclose(record.world_to_camera, view.camera.world_to_camera, atol=1e-9)
-    notes = [note for note in dataset.notes if note.startswith("poses: ")]
-    assert [words in note for note in notes] == [True] * (words is not None)
+def test_poses_are_read_as_they_fit_the_photos(tmp_path, photos, views, matrix_of, words):
+    check(write_transforms(tmp_path, photos, views, matrix_of), views, words)
 
 
-def test_poses_that_fit_by_no_convention_are_named(tmp_path, views):
+@pytest.mark.parametrize(
+    ("axes", "words"),
+    [
+        ([[0, 1, 0], [1, 0, 0], [0, 0, -1]], None),
+        (FLIP[:3, :3], "poses_bounds.npy puts them; they are read as camera-to-world in OpenGL's axes"),
+    ],
+)
+def test_axes_of_poses_bounds_are_found(tmp_path, photos, views, axes, words):
+    check(write_llff(tmp_path, photos, views, axes), views, words)
+
+
+@pytest.mark.parametrize(
+    ("pose_of", "words"),
+    [
+        (lambda pose: (quaternion(pose), pose[:3, 3]), None),
+        (lambda pose: (np.roll(quaternion(pose), -1), pose[:3, 3]), "quaternions in the order x, y, z, w"),
+        (
+            lambda pose: (quaternion(pose), -pose[:3, :3].T @ pose[:3, 3]),
+            "rotations world-to-camera with the cameras' positions, in OpenCV's axes",
+        ),
+    ],
+)
+def test_conventions_of_other_programs_in_colmap_models_are_found(tmp_path, photos, views, pose_of, words):
+    check(write_colmap(tmp_path, photos, views, pose_of), views, words)
+
+
+@pytest.mark.parametrize(
+    ("lens", "words"),
+    [
+        (lambda right: {"fl_x": 2 * right}, "a focal length of"),
+        (lambda right: {"fl_x": 2 * right, "cx": LARGER * 160, "cy": LARGER * 160}, "a focal length of"),
+        (lambda right: {"k1": 6.0}, "it is read with no distortion"),
+    ],
+)
+def test_a_lens_that_does_not_fit_the_photos_is_mended(tmp_path, photos, views, lens, words):
+    right = LARGER * views[0].camera.fx
+    folder = write_transforms(tmp_path, photos, views, lambda pose: np.linalg.inv(pose) @ FLIP, **lens(right))
+    record = check(folder, views, words).records[0]
+    assert record.lens.focal[0] == pytest.approx(right, rel=0.06)
+    assert record.lens.is_pinhole and record.lens.centre == pytest.approx([LARGER * 80] * 2, rel=0.06)
+
+
+def test_the_check_is_made_once_and_again_if_a_pose_changes(tmp_path, photos, views, monkeypatch):
+    folder = write_transforms(tmp_path / "set", photos, views, np.linalg.inv)
+    first = parse_dataset(folder, holdout=0, cache=tmp_path / "cache")
+    monkeypatch.setattr("sehdr_warp.scene.pose_conventions.shared_pixels", lambda *_: iter(()))
+    again = parse_dataset(folder, holdout=0, cache=tmp_path / "cache")
+    assert again.notes == first.notes and any("read as camera-to-world" in note for note in again.notes)
+    write_transforms(tmp_path / "other", photos, [*views[1:], views[0]], np.linalg.inv)
+    assert not any("poses: " in note for note in parse_dataset(tmp_path / "other", cache=tmp_path / "cache").notes)
+
+
+def test_poses_that_fit_by_no_convention_are_named(tmp_path, photos, views):
     """A set whose photos were renamed: each has the pose of another."""
-    shuffled = [view.camera.world_to_camera for view in views]
-    poses = iter([*shuffled[7:], *shuffled[:7]][::-1])
-    dataset = parse_dataset(write(tmp_path, views, lambda _: np.linalg.inv(next(poses)) @ FLIP), holdout=0)
-    assert any("they do not fit the photos, by no convention" in note for note in dataset.notes)
+    order = np.random.default_rng(1).permutation(len(views))
+    shuffled = [replace(view, camera=views[k].camera) for view, k in zip(views, order, strict=True)]
+    folder = write_transforms(tmp_path, photos, shuffled, lambda pose: np.linalg.inv(pose) @ FLIP)
+    notes = [note for note in parse_dataset(folder, holdout=0).notes if note.startswith("poses: ")]
+    assert len(notes) == 1
+    assert "transforms.json does not fit the photos, by no convention" in notes[0]
+    assert "give a folder with the photos alone" in notes[0]
