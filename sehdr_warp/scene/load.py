@@ -17,6 +17,7 @@ from .exposure.times import choose_exposure, exposures_note, with_exposure_times
 from .file_names import image_folder, unique_names
 from .float_photos import with_float_times
 from .masks import assign_masks
+from .photo_names import photo_labels
 from .photos import usable_photos
 from .pose_conventions import POSED, with_fitting_cameras
 from .preprocess import preprocess
@@ -113,8 +114,9 @@ def load_scene(
         names = [names[index] for index in indices]
         dataset = replace(dataset, records=tuple(dataset.records[index] for index in indices))
     scene = preprocess(dataset, curve, max_size, photo_storage, names)
-    named_views = zip(names, dataset.records, strict=True)
-    guessed = {name: record.image.name for name, record in named_views if not record.time_known}
+    labels = photo_labels([record.image for record in dataset.records])
+    named_views = zip(names, labels, dataset.records, strict=True)
+    guessed = {name: label for name, label, record in named_views if not record.time_known}
     if guessed and cameras:  # The training estimated them by points of structure from motion, which are not here.
         run_times = {camera.file: camera.exposure_time for camera in cameras}
         times = {name: run_times[file] for name, file in guessed.items() if file in run_times}

@@ -7,6 +7,7 @@ the forms in which Unicode writes an accent, do not matter. Of several names the
 
 import os
 import unicodedata
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,14 @@ from .images.ldr_files import LDR_SUFFIXES
 def fold_name(name: str) -> str:
     """Return a name in which upper and lower case, and the forms of an accent, are the same."""
     return unicodedata.normalize("NFC", name).casefold()
+
+
+def photo_labels(images: Sequence[Path]) -> list[str]:
+    """Return the file name of each photo, with its folder in front if photos of several folders share the name."""
+    counts = Counter(fold_name(image.name) for image in images)
+    return [
+        f"{image.parent.name}/{image.name}" if counts[fold_name(image.name)] > 1 else image.name for image in images
+    ]
 
 
 def bases_of(images: Sequence[Path], folder: Path) -> list[Path]:

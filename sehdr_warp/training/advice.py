@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..runs.config_files import config_fields, flag_text
 from ..runs.run import Run
+from ..runs.scene_description import FOUND
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 from ..subsets import first_names
 
@@ -18,6 +19,8 @@ STILL_RISING = 0.2  # dB that held-out photos gained in the last third of the st
 UNFINISHED = 0.5  # dB gained there from which blur explains what differs from the photos, and not their exposure
 FALLING = 0.5  # dB that they lost since their best in a training that overfits; seeds differ by up to 0.3 dB
 EXPOSURE_JUMP = 0.4  # Stops between a whole photo and the scene from which its exposure is not as stated
+FAILED = 17.0  # dB of held-out photos below which the scene as a whole is wrong: sound captures have 19 to 35
+_MISFIT = "not fit the photos, by no convention"  # Of a note on poses; see scene.pose_conventions
 _FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
@@ -51,7 +54,10 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
     words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
     summary = run.summary() | {"metrics": run.metrics()}
     scene, unplaced = data.get("path") or "SCENE", trainer.scene.unplaced
-    return advice(run.path, summary, photos, scene, words, trainer.first_iteration, unplaced, steps)
+    source = trainer.scene.views[0].source
+    posed = str(source.parent) if source is not None and trainer.scene.format not in FOUND else None
+    misfit = any(_MISFIT in note for note in trainer.scene.notes)
+    return advice(run.path, summary, photos, scene, words, trainer.first_iteration, unplaced, steps, posed, misfit)
 
 
 def advice(
@@ -63,6 +69,8 @@ def advice(
     resumed_at: int = 0,
     unplaced: int = 0,
     steps: int | None = None,
+    posed: str | None = None,
+    misfit: bool = False,
 ) -> list[str]:
     """Return lines of advice on a finished training; none if nothing stands out.
 
@@ -76,11 +84,19 @@ def advice(
             there, as at the end of a run that is given more steps, gains before it do not count.
         unplaced: Number of photos without a camera.
         steps: Iterations that the user set, for the commands; None if they were planned.
+        posed: Folder of the photos, if the set states their cameras; None if structure from motion found them.
+        misfit: Whether a note says that the stated cameras do not fit the photos.
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
     shorter = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
     again = shorter if steps is None else f"{shorter} --iterations {steps}"
     points, lines, gain = evaluations(summary["metrics"]), [], 0.0
+    alone = posed is not None and Path(posed).resolve() != Path(scene).resolve()
+    where = "from the photos alone" if alone else "from the photos in a folder PHOTOS of their own"
+    words = ["sehdr-warp", "train", posed if alone and posed else "PHOTOS", "--out", str(path), *options, "--overwrite"]
+    anew = f"{where}: {shlex.join(words)}"
+    if misfit:
+        return [f"the cameras that the set states do not fit its photos; find them anew {anew}"]
     few_placed = 2 * unplaced >= train_photos
     if few_placed:
         lines.append(
@@ -94,6 +110,11 @@ def advice(
         earlier = [point for point in points[:-1] if point.iteration <= since] or points[:1]
         before = max(earlier, key=attrgetter("psnr"))
         gain = points[-1].psnr - before.psnr
+        if gain < UNFINISHED and not few_placed and (best := max(point.psnr for point in points)) < FAILED:
+            remedy = "photos from places between them would help most"
+            remedy += f"; or find their cameras anew {anew}" if posed else f": {again}"
+            likely = "photos overlap too little, or their cameras are wrong"
+            return [f"held-out photos are at {best:.1f} dB, so the scene as a whole does not fit: {likely}; {remedy}"]
         if gain > STILL_RISING:
             command = f"sehdr-warp train --resume --out {run} --iterations {2 * iterations}"
             lines.append(

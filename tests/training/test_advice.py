@@ -95,6 +95,22 @@ def test_few_photos_and_movement():
     assert line.startswith("3 photos are few")
 
 
+def test_a_scene_that_fits_nowhere_blames_cameras_and_overlap_and_nothing_that_moved():
+    figures = summary([11, 14.9, 15.2], regions=100)
+    [line] = advice(Path("r"), figures, 54, "set", posed="set/images")
+    assert (
+        line.startswith("held-out photos are at 15.2 dB") and "overlap too little, or their cameras are wrong" in line
+    )
+    assert line.endswith("from the photos alone: sehdr-warp train set/images --out r --overwrite")
+    [line] = advice(Path("r"), figures, 54, "photos")
+    assert line.endswith("would help most: sehdr-warp train photos --out r --overwrite") and "anew" not in line
+    assert "more steps help" in advice(Path("r"), summary([11, 13, 15]), 54)[0]
+    [line] = advice(Path("r"), summary([22, 22, 22], regions=900), 54, posed="set/images", misfit=True)
+    assert line.startswith("the cameras that the set states do not fit its photos") and "set/images" in line
+    [line] = advice(Path("r"), figures, 54, "set", posed="set")  # Beside the file of their poses
+    assert line.endswith("in a folder PHOTOS of their own: sehdr-warp train PHOTOS --out r --overwrite")
+
+
 def test_a_finished_run_goes_on_with_more_iterations(tmp_path, logged):
     config = {"schedule.iterations": 24, "plan.enabled": False}
     train(toy_scene(), tmp_path / "run", config, device="cpu")

@@ -3,6 +3,8 @@
 import itertools
 import logging
 import os
+import re
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -18,7 +20,7 @@ from ..exposure.stack import refuse_stack
 from ..file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
 from ..images.heif import HEIF_SUFFIXES, register_heif
 from ..images.ldr_files import PHOTO_SUFFIXES
-from ..photo_names import fold_name
+from ..photo_names import fold_name, photo_labels
 from ..photos import FEWEST_PHOTOS
 from ..raw.decode import color_matrix
 from ..sfm.panoramas import are_panoramas, reconstruct_panoramas
@@ -47,6 +49,8 @@ _POSE_CONTENT = {
     ".xml": (b"<chunk", "Metashape"), ".csv": (b"#name,x,y", "RealityScan"), ".xmp": (b"xcr:", "RealityScan"),
     ".out": (b"Bundle file", "Bundler"), ".json": (b'"cameraPoseARFrame"', "3D Scanner App"),
 }  # fmt: skip
+_MEDIA = (*VIDEO_SUFFIXES, *UNSTITCHED_SUFFIXES, *HEIF_SUFFIXES)  # Which a user may mean beside a folder of photos
+_CAMERA_FOLDER = re.compile(r"\d{6}_[a-z_]|\d{3}([a-z0-9_]{5})")  # 202410__ of an iPhone, and 100CANON
 _ALIKE = 5.0  # Degrees; 1.8 between sets of 9 photos of which one has 49 points, 8 and more if people or objects move
 _MOST_READ = 20  # Files of one suffix whose content is looked at
 _CAMERA_FILES = ("transforms.json", "reconstruction.json", "poses_bounds.npy")  # Beside a folder of photos
@@ -62,6 +66,8 @@ def find_photos(folder: Path) -> DataparserOutputs:
     candidates = [list_images(place, PHOTO_SUFFIXES) for place in places]
     # A single picture beside `images/` is a cover.
     photos = next((each for each in candidates if len(each) > 1), next(filter(None, candidates), []))
+    together = _folders_of_a_camera(folder) if not photos else []
+    photos = photos or [photo for place in together for photo in list_images(folder / place, PHOTO_SUFFIXES)]
     if not photos:
         if heif := next((file for file in sorted(folder.iterdir()) if file.suffix.lower() in HEIF_SUFFIXES), None):
             register_heif(heif)
@@ -74,6 +80,10 @@ def find_photos(folder: Path) -> DataparserOutputs:
     photos = [photo for photo in photos if photo not in copies]
     _require_photos(photos, folder, len(copies))
     notes = [*copies_note(copies), *_foreign_poses(folder), *_cameras_above(folder)]
+    if together:
+        counts = Counter(photo.parent for photo in photos)
+        taken = ", ".join(f"{place} ({counts[folder / place]})" for place in together)
+        notes.append(f"photos are read from the folders of one camera: {taken}")
     if model := find_model(folder, anywhere=True):
         place = model.relative_to(folder).as_posix()
         notes.append(f"the COLMAP model in {place} names none of these photos and is not used")
@@ -92,10 +102,22 @@ def inner_folder(folder: Path) -> Path | None:
 
     Archives and exports have their photos in folders of folders; a single picture beside them is a cover.
     """
-    if len(list_images(folder, PHOTO_SUFFIXES)) > 1 or unread_kinds(folder) or _foreign_poses(folder):
+    media = any(file.suffix.lower() in _MEDIA for file in folder.iterdir())
+    if len(list_images(folder, PHOTO_SUFFIXES)) > 1 or media or _foreign_poses(folder):
         return None
     inner = _folders_with_photos(folder)
     return folder / inner[0] if len(inner) == 1 and inner[0] not in ("images", INPUT) else None
+
+
+def _folders_of_a_camera(folder: Path) -> list[str]:
+    """List folders into which one camera sorted its photos, such as DCIM/100CANON and 101CANON, as paths in a folder.
+
+    The list is empty if other folders hold photos, too.
+    """
+    inner = _folders_with_photos(folder)
+    names = [_CAMERA_FOLDER.fullmatch(Path(each).name.lower()) for each in inner]
+    makers = {name[1] if name else each for name, each in zip(names, inner, strict=True)}
+    return inner if all(names) and len(makers) == 1 and len({Path(each).parent for each in inner}) == 1 else []
 
 
 def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[DataparserOutputs, list[str]]:
@@ -122,9 +144,10 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
         raise
     model, placed, unplaced = reconstruction.model, [], []
     cameras = {int(Path(image.name).stem): image for image in model.images}
+    labels = photo_labels(photos)
     for i, record in enumerate(dataset.records):
         if (image := cameras.get(i)) is None:
-            unplaced.append(record.image.name)
+            unplaced.append(labels[i])
         else:
             uncertain = i in reconstruction.weak
             placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera, uncertain=uncertain))
@@ -140,14 +163,22 @@ def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> 
     Raises:
         InputError: if no photo has a camera.
     """
-    by_name = {camera.file: camera for camera in cameras}
-    folded = {fold_name(name): name for name in by_name}
-    placed, others, names = [], [], [record.image.name for record in dataset.records]
+    by_name: dict[str, list[int]] = {}
+    for number, camera in enumerate(cameras):
+        for key in {camera.file, "folded " + fold_name(camera.file)}:
+            by_name.setdefault(key, []).append(number)
+    placed, others, names = [], [], photo_labels([record.image for record in dataset.records])
+    left = set(range(len(cameras)))
     for index, (record, name) in enumerate(zip(dataset.records, names, strict=True)):
-        if (camera := by_name.pop(name if name in by_name else folded.get(fold_name(name), name), None)) is None:
+        # Runs may state the file name alone of photos that share it, in their order.
+        keys = [name, record.image.name]
+        keys += ["folded " + fold_name(key) for key in keys]
+        if (number := next((n for key in keys for n in by_name.get(key, ()) if n in left), None)) is None:
             others.append(index)
         else:
-            placed.append(replace(record, lens=camera.lens, world_to_camera=camera.world_to_camera, split=camera.split))
+            left.remove(number)
+            lens, pose, split = cameras[number].lens, cameras[number].world_to_camera, cameras[number].split
+            placed.append(replace(record, lens=lens, world_to_camera=pose, split=split))
     if not placed:
         problem = f"holds none of the {len(cameras)} photos that the run was trained with, but {first_names(names)}"
         raise InputError(dataset.folder, problem, "say where they are")
@@ -155,9 +186,9 @@ def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> 
     if others:
         count = counted(len(others), "photo is not in the run and is", "photos are not in the run and are")
         notes.append(f"{count} left out: {all_names(names, others)}")
-    if by_name:
-        count = counted(len(by_name), "photo of the run is", "photos of the run are")
-        notes.append(f"{count} missing: {', '.join(by_name)}")
+    if left:
+        count = counted(len(left), "photo of the run is", "photos of the run are")
+        notes.append(f"{count} missing: {', '.join(cameras[number].file for number in sorted(left))}")
     return replace(dataset, records=tuple(placed), notes=(*dataset.notes, *notes)), [names[i] for i in others]
 
 

@@ -24,15 +24,16 @@ _KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", *JPEG_SUFFI
 def find_copies(photos: Sequence[Path]) -> dict[Path, Path]:
     """Return the photos that are copies of another one, each with that other one.
 
-    They have the same bytes, or the same picture and one name but for the suffix or the mark of an edited photo. A
-    held-out photo would have its copy among the training photos, and an editor changes the camera's response.
+    They have the same bytes, or lie in one folder and have the same picture and one name but for the suffix or the mark
+    of an edited photo. A held-out photo would have its copy among the training photos, and an editor changes the
+    camera's response.
     """
     copies, photos = _equal_files(photos)
-    by_stem: dict[str, list[Path]] = {}
+    by_stem: dict[tuple[Path, str], list[Path]] = {}
     for photo in photos:
         if photo.suffix.lower() in LDR_SUFFIXES:
-            by_stem.setdefault(_EDITED.sub("", photo.stem.lower()), []).append(photo)
-    for stem, group in by_stem.items():
+            by_stem.setdefault((photo.parent, _EDITED.sub("", photo.stem.lower())), []).append(photo)
+    for (_, stem), group in by_stem.items():
         best, *others = sorted(group, key=lambda p: (p.stem.lower() != stem, _KINDS.index(p.suffix.lower())))
         pictures = [_thumbnail(photo) for photo in (best, *others)] if others else []
         for photo, picture in zip(others, pictures[1:], strict=True):

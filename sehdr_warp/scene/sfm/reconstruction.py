@@ -29,6 +29,7 @@ from ...subsets import all_names, counted
 from ..cached_folder import cached_folder, file_digest
 from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from ..masks import write_reduced
+from ..photo_names import photo_labels
 from ..photos import BRIGHTENING, brightened_codes, read_photo, unusable_notes
 from ..readers.colmap_model import SparseModel, read_model
 from .pairs import FEATURES, PARTNERS, RATIO, likely_pairs, pairs_with
@@ -73,7 +74,7 @@ class Reconstruction:
         """Return a line for each reason not to trust the places of the cameras, with the photos concerned."""
         registered = {int(Path(image.name).stem) for image in self.model.images}
         unregistered, notes = [i for i in range(len(photos)) if i not in registered], []
-        names = [photo.name for photo in photos]
+        names = photo_labels(photos)
         if unregistered:
             were = f"could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out"
             advice = "photos between these and the others help"

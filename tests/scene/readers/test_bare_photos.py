@@ -82,6 +82,33 @@ def test_photos_in_several_folders_belong_into_one(tmp_path):
         parse_dataset(tmp_path)
 
 
+@pytest.mark.parametrize("names", [("100CANON", "101CANON"), ("202409__", "202410_a")])
+def test_folders_of_one_camera_are_one_set(tmp_path, names):
+    """A memory card: numbers of files begin again in the second folder."""
+    for count, name in zip((4, 2), names, strict=True):
+        for i in range(count):
+            (place := tmp_path / "DCIM" / name).mkdir(parents=True, exist_ok=True)
+            Image.fromarray(pattern(16, 12, 5 * count + i)).save(place / f"IMG_{i}.jpg")
+    files(tmp_path, "MISC/a.ctg")
+    dataset = find_photos(tmp_path)
+    first, second = (f"DCIM/{name}" for name in names)
+    assert f"photos are read from the folders of one camera: {first} (4), {second} (2)" in dataset.notes
+    lens = Lens("SIMPLE_PINHOLE", 16, 12, (20.0, 8, 6), tmp_path)
+    labels = [f"{names[0]}/IMG_0.jpg", f"{names[0]}/IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg", f"{names[1]}/IMG_1.jpg"]
+    cameras = [PlacedPhoto(label, lens, index * np.eye(4), "train", 1.0) for index, label in enumerate(labels)]
+    placed = parse_dataset(tmp_path, cameras=cameras)
+    assert [record.world_to_camera[0, 0] for record in placed.records] == [0, 1, 2, 3, 4]
+    assert [record.image.parent.name for record in placed.records] == [names[0]] * 4 + [names[1]]
+    assert f"1 photo is not in the run and is left out: {names[1]}/IMG_0.jpg" in placed.notes
+
+
+def test_folders_of_two_cameras_are_not_joined(tmp_path):
+    photos(tmp_path / "100CANON")
+    photos(tmp_path / "100NIKON")
+    with pytest.raises(InputError, match="give one of its folders with photos: 100CANON, 100NIKON; or put"):
+        parse_dataset(tmp_path)
+
+
 def test_photos_as_3dgs_convert_expects_them(tmp_path):
     photos(tmp_path / "input")
     assert [record.image.parent.name for record in find_photos(tmp_path).records] == ["input"] * 4
