@@ -40,7 +40,7 @@ _OFF_CENTER = 0.1  # Part of a photo's size by which a principal point of anothe
 
 @dataclass(frozen=True)
 class _Verdict:
-    """How cameras are read: the names of a reading of poses and of what the lens lacks, and a note."""
+    """Reading of the poses and of the lenses of a set, and a note on it."""
 
     reading: str | None = None
     focal: float = 1.0  # Times the stated focal length
