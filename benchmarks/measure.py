@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from sehdr_warp.check.result import build
+from sehdr_warp.caches import package_hash
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import read_json, write_json
 
@@ -36,7 +36,9 @@ def main(pages: tuple[str, ...] = (), /, work: Path = Path("measured")) -> None:
     for name in pages or names:
         print(f"== {name}", flush=True)
         try:
-            write_json(REPORTS / "results" / f"{name}.json", measure(PAGES[name], work / build() / name), internal=True)
+            write_json(
+                REPORTS / "results" / f"{name}.json", measure(PAGES[name], work / package_hash() / name), internal=True
+            )
         except SehdrError as error:
             failed.append(name)
             print(error, file=sys.stderr)

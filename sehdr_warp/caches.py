@@ -1,5 +1,6 @@
-"""Folders for what the program can make again."""
+"""Folders for what the program can make again, and the hash by which builds of the package differ."""
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
@@ -25,3 +26,12 @@ def user_cache(name: str) -> Path | None:
     """Return the user's folder for what the program can make again; None if there is no home."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return None if home.startswith("~") else Path(home) / name
+
+
+def package_hash() -> str:
+    """Return eight hexadecimal digits of a hash over the package's code and presets, for versions of one name."""
+    root, digest = Path(__file__).resolve().parent, hashlib.sha256()
+    paths = (Path(folder, name) for folder, _, names in os.walk(root, followlinks=True) for name in names)
+    for path in sorted(path for path in paths if path.suffix in (".py", ".toml")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:8]

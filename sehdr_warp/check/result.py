@@ -1,6 +1,5 @@
 """The result of a measurement: rows and checks, with the machine and the command that produced them."""
 
-import hashlib
 import importlib.metadata
 import os
 import platform
@@ -15,6 +14,7 @@ import torch
 from torch.utils.collect_env import get_nvidia_driver_version, run
 
 from .. import __version__
+from ..caches import package_hash
 
 SCHEMA = 2
 
@@ -56,22 +56,10 @@ def _describe_machine(device: torch.device) -> dict[str, Any]:
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "build": build(),
+        "build": package_hash(),
         "versions": {"sehdr-warp": __version__} | {name: _version(name) for name in ("torch", "warp-lang", "gsplat")},
         "gpu": gpu,
     }
-
-
-def build() -> str:
-    """Return eight hexadecimal digits of a hash over the package's code and presets.
-
-    Results of one build share them.
-    """
-    root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
-    paths = (Path(folder, name) for folder, _, names in os.walk(root, followlinks=True) for name in names)
-    for path in sorted(path for path in paths if path.suffix in (".py", ".toml")):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:8]
 
 
 def _version(package: str) -> str | None:

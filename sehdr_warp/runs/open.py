@@ -9,7 +9,7 @@ import logging
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,6 +76,19 @@ def load_scene_and_log_notes(data: LoadArguments, **options: Any) -> Scene:
     for note in scene.notes:
         log.info("%s", note)
     return scene
+
+
+@dataclass(frozen=True)
+class PhotoRequest:
+    """Photos that a training reads, on each of its nodes."""
+
+    data: LoadArguments  # Arguments of load_scene() as a run saves them
+    options: dict[str, Any]  # Further arguments of load_scene(): response, method, candidates, cameras, photo_storage
+    cameras: tuple[CameraEntry, ...] = ()  # Of the run that is resumed, if its splits count
+
+    def load(self) -> Scene:
+        """Load the scene, held out as in the run that is resumed."""
+        return with_saved_splits(load_scene_and_log_notes(self.data, **self.options), self.cameras)
 
 
 def load_run_scene(run: Run, data: str | None) -> Scene:

@@ -77,11 +77,6 @@ class RenderableScene:
     reference: "RenderableScene | None" = None
 
     @property
-    def model(self) -> RadianceField:
-        """Older name of `field`."""
-        return self.field
-
-    @property
     def is_paged(self) -> bool:
         """True if the Gaussians do not fit into the GPU: those in view are copied to it for each picture."""
         return isinstance(self.field, PagedField)

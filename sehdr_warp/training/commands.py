@@ -17,11 +17,13 @@ from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
-from ..runs.open import known_cameras, load_scene_and_log_notes, response_for_loading, with_saved_splits
+from ..runs.open import PhotoRequest, known_cameras, load_scene_and_log_notes, response_for_loading
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
+    from ..runs.config import Config
     from ..runs.run import Run
+    from ..runs.run_writer import RunWriter
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +163,6 @@ def _run_in_rank(argv: list[str]) -> None:
 
 def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, on this rank."""
-    from ..response import Response
     from ..runs.run_writer import RunWriter
     from .machine import precompiling
     from .scene_facts import check_dataset_truth
@@ -170,27 +171,20 @@ def _train(args: Train, ranks=None) -> None:
     assert out is not None, "run_train() refuses it"
     # What can be refused is refused before the photos are read, which may take minutes.
     folder = RunWriter(out)
-    info: dict[str, Any] = {}
-    saved = None  # The config of a run that is resumed
-    if folder.prepare(resume=output.resume, overwrite=output.overwrite):
-        info, saved = folder.read_info(), folder.read_config()
-    elif output.resume:
+    resumes = folder.prepare(resume=output.resume, overwrite=output.overwrite)
+    if output.resume and not resumes:
         log.info("%s holds no run yet: a training begins there", out)
-    data, config = _load_arguments(args, info.get("data")), _config(args, saved)
-    device = pick_device(args.machine.device) if ranks is None else ranks.device
-    load_options, cameras = _load_options(config), ()
-    if saved is not None:  # Its response need not be chosen again; create_trainer() refuses another --response.
-        load_options["response"] = response_for_loading(saved, Response.from_dict(info["response"]))
-        saved_cameras = folder.read_cameras()
-        load_options["cameras"] = known_cameras(saved_cameras)
-        cameras = saved_cameras if args.scene.holdout is None else ()
+    saved = folder.read_config() if resumes else None
+    data, config = _load_arguments(args, folder.read_info()["data"] if resumes else None), _config(args, saved)
+    photos = PhotoRequest(data, _load_options(config))
+    if saved is not None:
+        photos = _photos_of_run(photos, folder, saved, keeps_splits=args.scene.holdout is None)
     check_dataset_truth(data, config)
+    device = pick_device(args.machine.device) if ranks is None else ranks.device
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
-            from .following import PhotoRequest
-
-            ranks.request_photos(PhotoRequest(data, load_options, cameras))
-        scene = with_saved_splits(load_scene_and_log_notes(data, **load_options), cameras)
+            ranks.request_photos(photos)
+        scene = photos.load()
         from ..console import run_with_progress
         from ..viewer.live import serve_training
         from .advice import advice_on, options_of_run
@@ -212,14 +206,25 @@ def _train(args: Train, ranks=None) -> None:
         with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
             # Iterating the trainer trains; serve_training() answers browsers between its steps.
             run_with_progress(steps, trainer.total)
-    # Options that the commands of the advice repeat
-    if output.resume:
-        options = options_of_run(trainer.run)
-    else:
-        options = configs.named_fields(args.fields) | {"response": args.scene.response, "preset": args.training.preset}
-        options |= {"seed": args.training.seed}
-    options |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
-    _print_result(args, trainer.run, advice_on(trainer, data, options))
+    repeated = options_of_run(trainer.run) if output.resume else _named_options(args)
+    repeated |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
+    _print_result(args, trainer.run, advice_on(trainer, data, repeated))
+
+
+def _photos_of_run(photos: PhotoRequest, folder: "RunWriter", config: "Config", *, keeps_splits: bool) -> PhotoRequest:
+    """Return a request with the response, cameras and splits of a run, so that none of them is decided anew."""
+    from ..response import Response
+
+    # create_trainer() refuses another --response.
+    response, cameras = Response.from_dict(folder.read_info()["response"]), folder.read_cameras()
+    options = {"response": response_for_loading(config, response), "cameras": known_cameras(cameras)}
+    return PhotoRequest(photos.data, photos.options | options, cameras if keeps_splits else ())
+
+
+def _named_options(args: Train) -> dict[str, Any]:
+    """Return the options on the command line of a new training that the commands of its advice repeat."""
+    options = {"response": args.scene.response, "preset": args.training.preset, "seed": args.training.seed}
+    return configs.named_fields(args.fields) | options
 
 
 def _print_plan(args: Train) -> None:

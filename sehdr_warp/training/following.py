@@ -10,25 +10,15 @@ import torch
 from ..errors import InputError
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
-from ..runs.open import load_scene_and_log_notes, with_saved_splits
+from ..runs.open import PhotoRequest, in_world_of_run
 from ..runs.run import exposure_compensation, field_from_checkpoint
-from ..runs.run_folder import CameraEntry
-from ..runs.scene_description import describe_scene, scene_difference
-from ..runs.values import LoadArguments
-from ..scene import Scene
+from ..runs.scene_description import FOUND, describe_scene, scene_difference
+from ..scene import Camera, Scene
+from ..scene.normalization import Normalization
 from .cost import gain_of_ranks
 from .ranks import Ranks
 from .trainer import Trainer
 from .training_state import load_state, state_of
-
-
-@dataclass(frozen=True)
-class PhotoRequest:
-    """Arguments with which the photos of other nodes are read."""
-
-    data: LoadArguments  # Arguments of load_scene() as a run saves them
-    options: dict[str, Any]  # Further arguments of load_scene(): response, method, candidates, cameras, photo_storage
-    cameras: tuple[CameraEntry, ...]  # Of the run that is resumed, whose splits count
 
 
 @dataclass(frozen=True)
@@ -73,8 +63,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
     scene = None
     if reads:
         request: PhotoRequest = ranks.requested_photos()
-        data = request.data if path is None else request.data | {"path": path}
-        scene = with_saved_splits(load_scene_and_log_notes(data, **request.options), request.cameras)
+        scene = replace(request, data=request.data | ({} if path is None else {"path": path})).load()
     message: TrainingMessage = ranks.broadcast_object()
     config = message.config
     tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in message.layout.items()}
@@ -82,6 +71,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
     checkpoint = Checkpoint(Path("rank 0"), tensors, message.values)
     field = field_from_checkpoint(checkpoint, config, message.info)
     if scene is not None:
+        scene = _in_world_of_rank_0(scene, message)
         compensation = exposure_compensation(message.info)
         scene = _training_part(scene if compensation is None else compensation.normalize_photos(scene, field.response))
         _check_same_photos(ranks, message, scene)
@@ -95,6 +85,15 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
     for _ in trainer:
         pass
     return trainer
+
+
+def _in_world_of_rank_0(scene: Scene, message: TrainingMessage) -> Scene:
+    """Return a scene with rank 0's cameras if structure from motion found them: each node may find another world."""
+    if scene.format not in FOUND or message.scene is None:
+        return scene
+    cameras = {view["name"]: Camera.from_dict(view["camera"]) for view in message.scene["views"]}
+    unit = Normalization.from_dict(message.info["normalization"]).unit
+    return in_world_of_run(scene, cameras, unit, "rank 0", scene.name)
 
 
 def _training_part(scene: Scene) -> Scene:

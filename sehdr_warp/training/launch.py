@@ -1,6 +1,5 @@
 """Processes that train together: start them for --gpus, and read rank and node that torchrun or --gpus state."""
 
-import hashlib
 import logging
 import os
 import platform
@@ -19,6 +18,7 @@ import torch
 import torch.distributed as dist
 import torch.multiprocessing as processes
 
+from ..caches import package_hash
 from ..errors import InputError, SehdrError
 
 FILE_STORE = "SEHDR_RANKS"
@@ -95,16 +95,10 @@ def _check_number(name: str, value: int, least: int, most: int) -> None:
 
 
 def installed_versions() -> str:
-    """Return the versions of this package, with a hash of its files, and of what it computes with.
-
-    The hash is there because a development version has one name for many states.
-    """
+    """Return the versions of this package, with its hash, and of what it computes with."""
     from .. import __version__
 
-    total = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
-        total.update(path.read_bytes())
-    own = f"sehdr-warp {__version__} ({total.hexdigest()[:8]}), torch {torch.__version__}"
+    own = f"sehdr-warp {__version__} ({package_hash()}), torch {torch.__version__}"
     return f"{own}, warp {version('warp-lang')}, Python {platform.python_version()}"
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
@@ -151,7 +152,7 @@ def test_other_nodes_hold_out_what_a_resumed_run_does(monkeypatch):
         loaded.append(scene)
         raise InterruptedError
 
-    monkeypatch.setattr(following, "load_scene_and_log_notes", lambda data, **options: scene)
+    monkeypatch.setattr("sehdr_warp.runs.open.load_scene_and_log_notes", lambda data, **options: scene)
     monkeypatch.setattr(following, "_check_same_photos", check)
     monkeypatch.setattr(following, "field_from_checkpoint", lambda *_: None)
     shared = SimpleNamespace(config=None, layout={}, values={}, info={})
@@ -160,6 +161,21 @@ def test_other_nodes_hold_out_what_a_resumed_run_does(monkeypatch):
     with pytest.raises(InterruptedError):
         following.train_as_worker(ranks)
     assert len(scene.train_views) == 5 and len(loaded[0].views) == 6
+
+
+def test_nodes_train_bare_photos_in_the_world_of_rank_0():
+    """Structure from motion on another node may move and scale the world; its views get rank 0's poses."""
+    scene = replace(toy_scene(), format="photos")
+    views = []
+    for view in scene.views:
+        pose = view.camera.world_to_camera.copy()
+        pose[:3, 3] = 2 * pose[:3, 3] - pose[:3, :3] @ [1, 2, 3]
+        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    found = replace(scene, views=tuple(views), points=2 * scene.points + [1, 2, 3])
+    message = SimpleNamespace(scene=describe_scene(scene), info={"normalization": {"center": [0, 0, 0], "unit": 4.0}})
+    aligned = following._in_world_of_rank_0(found, message)
+    _check_same_photos(SimpleNamespace(info=RankInfo(1, 2, 0, 1, 1, 2)), message, aligned)
+    np.testing.assert_allclose(aligned.points, scene.points, atol=1e-12)
 
 
 def test_nodes_start_as_many_processes_each(monkeypatch):
