@@ -128,14 +128,15 @@ class BlockPlan:
             fields["densification.cap_max"] = max(1, round(self.config.densification.cap_max * block.fraction))
         return override_config(self.config, fields, block.name)
 
-    def load_scene(self, names: list[str], photo_storage: str) -> Scene:
+    def load_scene(self, names: list[str]) -> Scene:
         """Load views of the set with the plan's response, exposure times and world.
 
         Raises:
             InputError: If they cannot be read, or have other cameras than when the set was divided.
         """
         response = response_for_loading(self.config, self.response)
-        scene = load_scene_and_log_notes(self.data | {"views": names}, response=response, photo_storage=photo_storage)
+        storage = self.config.load_options["photo_storage"]
+        scene = load_scene_and_log_notes(self.data | {"views": names}, response=response, photo_storage=storage)
         place = self.data.get("path") or self.scene
         scene = in_world_of_run(scene, self.cameras, self.normalization.unit, "the set", place)
         views = tuple(replace(view, exposure_time=self.exposure_times[view.name]) for view in scene.views)
@@ -204,12 +205,10 @@ class BlockPlan:
         )
 
 
-def make_block_plan(
-    data: LoadArguments, config: Config, device: torch.device, count: int | None, **selection: Any
-) -> BlockPlan | None:
+def make_block_plan(data: LoadArguments, config: Config, device: torch.device, count: int | None) -> BlockPlan | None:
     """Decide what all blocks of a set share, and divide the set into `count` blocks; None chooses their number.
 
-    `data` and `selection` (method, candidates, photo_storage) are arguments of load_scene().
+    `data` are arguments of load_scene().
 
     Returns:
         The plan; None if `count` is None and one training does.
@@ -219,7 +218,7 @@ def make_block_plan(
     """
     _check(config, data)
     size = min(data.get("max_size") or LARGEST_SIDE, LARGEST_SIDE)
-    scene = load_scene_and_log_notes(data | {"max_size": size}, response=config.response.name, **selection)
+    scene = load_scene_and_log_notes(data | {"max_size": size}, **config.load_options)
     check_views(scene)
     response = response_for_training(scene, config)
     times = {view.name: view.exposure_time for view in scene.views}

@@ -48,7 +48,7 @@ class StoppedTraining(RuntimeError):
 
 
 def train_block(
-    out: Path, index: int, device: str | None, photo_storage: str, versions: str, is_over: threading.Event | None = None
+    out: Path, index: int, device: str | None, versions: str, is_over: threading.Event | None = None
 ) -> BlockResult:
     """Train block `index` of the run in the folder `out`, which has blocks.json, or continue its training.
 
@@ -63,7 +63,7 @@ def train_block(
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     try:
-        _train(out, index, device, photo_storage, versions, is_over or threading.Event())
+        _train(out, index, device, versions, is_over or threading.Event())
     except Exception as error:
         message = as_user_error(error)
         if message is None:
@@ -72,9 +72,7 @@ def train_block(
     return BlockResult(None, platform.node())
 
 
-def _train(
-    out: Path, index: int, device: str | None, photo_storage: str, versions: str, is_over: threading.Event
-) -> None:
+def _train(out: Path, index: int, device: str | None, versions: str, is_over: threading.Event) -> None:
     """Train a block; raise SehdrError if this machine has other versions or photos than that which divided the set."""
     from ..training.train import create_trainer
 
@@ -84,7 +82,7 @@ def _train(
         return
     if (own := installed_versions()) != versions:
         raise SehdrError(f"it has {own}, and the command was started with {versions}; install the same on both")
-    scene = load_block_scene(plan, index, photo_storage)
+    scene = load_block_scene(plan, index)
     plan.check_photos(scene.views)
     data, config = plan.data | {"views": block.views}, plan.config_of(block)
     trainer = create_trainer(scene, folder, config, device=device, resume=True, data=data, shared=plan.shared)
@@ -95,10 +93,10 @@ def _train(
         raise StoppedTraining(f"stopped at iteration {trainer.iteration} of {trainer.total}")
 
 
-def load_block_scene(plan: BlockPlan, index: int, photo_storage: str) -> Scene:
+def load_block_scene(plan: BlockPlan, index: int) -> Scene:
     """Load the photos of a block, with the response and exposure times of the plan, and the points that they show."""
     names = plan.blocks[index].views
-    scene = plan.load_scene(names, photo_storage)
+    scene = plan.load_scene(names)
     if missing := [name for name in names if name not in {view.name for view in scene.views}]:
         raise SehdrError(f"{plan.scene}: {missing[0]} of {plan.blocks[index].name} cannot be read any more")
     options = plan.config.response

@@ -40,7 +40,6 @@ def run_blocks(
     *,
     device: torch.device,
     gpus: int = 1,
-    photo_storage: str = "auto",
     slurm: Mapping[str, str] | None = None,
     slurm_device: str | None = None,
 ) -> None:
@@ -64,7 +63,7 @@ def run_blocks(
         executors = local_executors(logs, slots, visible_gpus(device, slots) if device.type == "cuda" else [])
     else:
         executors = [slurm_executor(logs, slurm, gpu=not on_cpu)] * slots
-    arguments = ("cpu" if on_cpu else None), photo_storage, installed_versions()
+    arguments = ("cpu" if on_cpu else None), installed_versions()
     # Jobs that run beside each other on this machine share its processors.
     job = BlockJob(max(1, thread_count() // slots) if slurm is None and slots > 1 else None)
     running: dict[int, tuple[int, Any]] = {}

@@ -46,7 +46,7 @@ class TrainedBlock(NamedTuple):
     summary: dict[str, Any]  # Its summary.json
 
 
-def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage: str = "auto") -> RunWriter:
+def merge_blocks(out: Path, plan: BlockPlan, device: torch.device) -> RunWriter:
     """Write the merged run of trained blocks, whose borders are refined on `device`, in place of an earlier one.
 
     Raises InputError if a block is damaged or was trained with other options, or if no Gaussian is in any core.
@@ -63,7 +63,7 @@ def merge_blocks(out: Path, plan: BlockPlan, device: torch.device, photo_storage
     # A CPU refines in reasonable time what CPUs have trained.
     refines = device.type != "cpu" or not any(block.summary.get("peak_gpu_memory_bytes") for block in blocks)
     if refines:
-        refine_borders(tensors, owners, out, plan, device, photo_storage)
+        refine_borders(tensors, owners, out, plan, device)
     else:
         remedy = f"`sehdr-warp train --resume --out {out}` on a machine with one refines them"
         log.warning(

@@ -36,7 +36,7 @@ DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its box, standard deviat
 
 
 def refine_borders(
-    tensors: Mapping[str, Tensor], blocks: Tensor, out: Path, plan: BlockPlan, device: torch.device, photo_storage: str
+    tensors: Mapping[str, Tensor], blocks: Tensor, out: Path, plan: BlockPlan, device: torch.device
 ) -> None:
     """Train the Gaussians near borders, in place.
 
@@ -47,7 +47,7 @@ def refine_borders(
     distance = torch.from_numpy(plan.division.border_distance(places))
     for index, block in enumerate(plan.blocks):
         near = (blocks == index) & (distance < BAND * max(block.margin))
-        scene = None if not near.any() else _border_photos(plan, index, places[near.numpy()], photo_storage)
+        scene = None if not near.any() else _border_photos(plan, index, places[near.numpy()])
         if scene is None:
             continue
         rows, visible = near.nonzero()[:, 0], _visible_rows(tensors, plan, [view.camera for view in scene.train_views])
@@ -60,9 +60,9 @@ def refine_borders(
             tensors[name][rows] = values.cpu()
 
 
-def _border_photos(plan: BlockPlan, index: int, points: np.ndarray, photo_storage: str) -> Scene | None:
+def _border_photos(plan: BlockPlan, index: int, points: np.ndarray) -> Scene | None:
     """Return the block's scene with the training photos that show points [M, 3] near its borders; None for none."""
-    scene = load_block_scene(plan, index, photo_storage)
+    scene = load_block_scene(plan, index)
     views = tuple(
         view
         for view in scene.train_views  # Occlusion is ignored.

@@ -18,7 +18,7 @@ class BlockJob:
         """Set the threads that the job may use on the CPU; None for all of its machine."""
         self.threads = threads
 
-    def __call__(self, out: Path, index: int, device: str | None, photo_storage: str, versions: str) -> Any:
+    def __call__(self, out: Path, index: int, device: str | None, versions: str) -> Any:
         """Train the block; arguments and result as of train_block()."""
         requeue, is_over = signal.getsignal(signal.SIGUSR2), threading.Event()
         if callable(requeue):  # submitit's, in jobs of SLURM.
@@ -32,7 +32,7 @@ class BlockJob:
         from .job import StoppedTraining, train_block
 
         try:
-            return train_block(out, index, device, photo_storage, versions, is_over)
+            return train_block(out, index, device, versions, is_over)
         except StoppedTraining:
             if is_over.is_set() and callable(requeue):
                 requeue(signal.SIGUSR2, None)  # Does not return.

@@ -44,7 +44,6 @@ def train_in_blocks(
     slurm_device: str | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    photo_storage: str = "auto",
 ) -> Run | None:
     """Train a set of photos in blocks and merge them into one run.
 
@@ -59,7 +58,6 @@ def train_in_blocks(
         slurm_device: "cpu" for SLURM jobs without a GPU; else each has one, whatever `device` is.
         resume: Continue; finished blocks are not run again.
         overwrite: Replace a training in blocks in `out`.
-        photo_storage: Where photos are stored, see load_scene().
 
     Returns:
         The merged run; None if `count` is None and one training does for the set.
@@ -70,9 +68,7 @@ def train_in_blocks(
     """
     plan = _continue(out, data, config, count) if _check(out, resume=resume, overwrite=overwrite) else None
     if plan is None:
-        options = config.response
-        selection = {"method": options.method, "candidates": options.candidates, "photo_storage": photo_storage}
-        plan = make_block_plan(data, config, device, count, **selection)
+        plan = make_block_plan(data, config, device, count)
         if plan is None:
             return None
         if overwrite:
@@ -84,11 +80,10 @@ def train_in_blocks(
     if resume and _is_merged(out, plan, device):
         log.info("%s: all blocks are trained and merged", out)
         return load_run(out, device=device)
-    jobs = {"photo_storage": photo_storage, "slurm": slurm, "slurm_device": slurm_device}
-    run_blocks(out, plan, device=device, gpus=gpus, **jobs)
-    folder = merge_blocks(out, plan, device, photo_storage)
+    run_blocks(out, plan, device=device, gpus=gpus, slurm=slurm, slurm_device=slurm_device)
+    folder = merge_blocks(out, plan, device)
     run = load_run(out, device=device)
-    errors = _measure(run, plan, photo_storage)
+    errors = _measure(run, plan)
     if errors is not None:
         line = {"iteration": run.iterations, "seconds": round(run.train_seconds, 3), "split": "test"}
         folder.append_metrics(line | {"psnr_ldr": round(errors.psnr, 4), "gaussians": run.gaussian_count})
@@ -138,11 +133,11 @@ def _continue(out: Path, data: LoadArguments, config: Config, count: int | None)
     return plan
 
 
-def _measure(run: Run, plan: BlockPlan, photo_storage: str) -> SeamErrors | None:
+def _measure(run: Run, plan: BlockPlan) -> SeamErrors | None:
     """Return the errors of the merged run on held-out photos; None if there are none."""
     names = [entry.name for entry in run.cameras if entry.split == "test" and entry.camera.is_pinhole]
     names = every_nth(names, MOST_VIEWS)
     if not names:
         return None
-    scene = plan.load_scene(names, photo_storage)
+    scene = plan.load_scene(names)
     return measure_seams(run, run.normalize_photos(scene).views, plan.division)

@@ -276,6 +276,13 @@ class Config(_Table):
         return max(1, round(iteration * self.schedule.iterations / REFERENCE_ITERATIONS))
 
     @property
+    def load_options(self) -> dict[str, Any]:
+        """Arguments of load_scene() that a config states."""
+        response, cache = self.response, self.schedule.photo_cache
+        options = {"response": response.name, "method": response.method, "candidates": response.candidates}
+        return options | {"photo_storage": "memory" if cache == "device" else cache}
+
+    @property
     def checkpoint_interval(self) -> int:
         """Iterations of this training between checkpoints."""
         return self.scaled(self.schedule.checkpoint_every)

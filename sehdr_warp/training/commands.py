@@ -176,7 +176,7 @@ def _train(args: Train, ranks=None) -> None:
         log.info("%s holds no run yet: a training begins there", out)
     saved = folder.read_config() if resumes else None
     data, config = _load_arguments(args, folder.read_info()["data"] if resumes else None), _config(args, saved)
-    photos = PhotoRequest(data, _load_options(config))
+    photos = PhotoRequest(data, config.load_options)
     if saved is not None:
         photos = _photos_of_run(photos, folder, saved, keeps_splits=args.scene.holdout is None)
     check_dataset_truth(data, config)
@@ -233,18 +233,11 @@ def _print_plan(args: Train) -> None:
     from .plan import make_plan
 
     data, config, device = _load_arguments(args, None), _config(args, None), pick_device(args.machine.device)
-    plan = make_plan(load_scene_and_log_notes(data, **_load_options(config)), config, device)
+    plan = make_plan(load_scene_and_log_notes(data, **config.load_options), config, device)
     choices, recommended = estimate(plan, config, device, args.machine.gpus)
     cost = {"choices": [choice.to_dict() for choice in choices], "recommended": recommended}
     lines = plan.table(), "estimated cost", *(choice.line() for choice in choices), f"recommended: {recommended}"
     print(json.dumps(plan.to_dict() | {"cost": cost}) if args.output.json else "\n".join(lines))
-
-
-def _load_options(config) -> dict[str, Any]:
-    """Return the arguments of load_scene() that a config states."""
-    response, cache = config.response, config.schedule.photo_cache
-    options = {"response": response.name, "method": response.method, "candidates": response.candidates}
-    return options | {"photo_storage": "memory" if cache == "device" else cache}
 
 
 def _print_result(args: Train, run: "Run", advice: Sequence[str] = ()) -> None:
@@ -286,12 +279,11 @@ def _train_blocks(args: Train) -> "Run | None":
     if machine.slurm is None:
         check_devices(device, machine.gpus)
     plan = BlockPlan.read(output.out) if output.resume and is_in_blocks(output.out) else None
-    config = _config(args, None if plan is None else plan.config)
     blocks = args.training.blocks
     return train_in_blocks(
         _load_arguments(args, None if plan is None else plan.data),
         output.out,
-        config,
+        _config(args, None if plan is None else plan.config),
         int(blocks) if blocks not in (None, "auto") else None,
         device=device,
         gpus=machine.gpus,
@@ -299,7 +291,6 @@ def _train_blocks(args: Train) -> "Run | None":
         slurm_device="cpu" if device.type == "cpu" and machine.device is not None else None,
         resume=output.resume,
         overwrite=output.overwrite,
-        photo_storage=_load_options(config)["photo_storage"],
     )
 
 

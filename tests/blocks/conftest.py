@@ -50,7 +50,7 @@ def two_blocks(survey, divide, tmp_path_factory):
         out = tmp_path_factory.mktemp("trained") / "run"
         plan = divide(survey, out, iterations)
         for index in (0, 1):
-            assert train_block(out, index, "cpu", "auto", installed_versions()).error is None
+            assert train_block(out, index, "cpu", installed_versions()).error is None
         return out, plan
 
     return train

@@ -24,7 +24,7 @@ def divided(survey, divide, tmp_path_factory):
 
 def test_a_machine_with_other_versions_trains_nothing(divided):
     folder, plan = divided
-    result = train_block(folder / "run", 0, "cpu", "auto", "sehdr-warp 0.1")
+    result = train_block(folder / "run", 0, "cpu", "sehdr-warp 0.1")
     assert f"it has {installed_versions()}, and the command was started with sehdr-warp 0.1" in result.error
     assert not folder_of(folder / "run", plan, 0).exists()
 
@@ -35,7 +35,7 @@ def test_a_machine_with_other_photos_trains_nothing(divided):
     before = photo.read_bytes()
     photo.write_bytes(before + b"more")
     try:
-        result = train_block(folder / "run", 0, "cpu", "auto", installed_versions())
+        result = train_block(folder / "run", 0, "cpu", installed_versions())
     finally:
         photo.write_bytes(before)
     sizes = f"has {len(before) + 4} bytes, and had {len(before)} when the set was divided"

@@ -31,7 +31,7 @@ def test_only_gaussians_near_borders_change_and_the_border_gets_better(two_block
     out, plan = two_blocks(150)
     before, blocks = merged_rows(out, plan)
     after = {name: values.clone() for name, values in before.items()}
-    refine_borders(after, blocks, out, plan, torch.device("cpu"), "auto")
+    refine_borders(after, blocks, out, plan, torch.device("cpu"))
 
     places = plan.normalization.scene_points(before["means"].numpy())
     far = plan.division.border_distance(places) > BAND * plan.division.margins.max()

@@ -44,12 +44,12 @@ def test_blocks_of_bare_photos_stay_in_the_world_of_the_set(tmp_path, monkeypatc
     data = {"path": str(tmp_path / "photos"), "exposure_index": None, "max_size": None, "holdout": None}
     plan = make_block_plan(data, config, torch.device("cpu"), 2)
     assert plan is not None
-    before = [load_block_scene(plan, index, "auto") for index in range(2)]
+    before = [load_block_scene(plan, index) for index in range(2)]
     plan.write(tmp_path)
     others = {name: in_other_world(camera) for name, camera in cameras.items()}
     find_cameras(monkeypatch, others, points=3 * points @ TURN.T + [1, 2, 3])
     for index, scene in enumerate(before):
-        after = load_block_scene(BlockPlan.read(tmp_path), index, "auto")
+        after = load_block_scene(BlockPlan.read(tmp_path), index)
         assert len(scene.points) > 0
         np.testing.assert_allclose(after.points, scene.points, atol=1e-9)
         for view, other in zip(scene.views, after.views, strict=True):
