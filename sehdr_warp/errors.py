@@ -115,7 +115,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def missing(path: Path | str, problem: str, remedy: str) -> InputError:
-    """Return the error of a path that does not exist; the remedy is what it may be a misspelling of, if there is one.
+    """Return the error of a path that does not exist; the remedy names a similar path beside it, if there is one.
 
     Args:
         path: What is not there.

@@ -120,7 +120,7 @@ def refuse_links(path: Path, folder: Path) -> None:
             return
         if place.is_symlink():
             problem = "is a link, and links in it are not followed"
-            raise InputError(place, problem, "copy what it leads to into its place")
+            raise InputError(place, problem, "replace the link by the file or folder that it leads to")
 
 
 def has_file(path: Path) -> bool:

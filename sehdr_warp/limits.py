@@ -105,7 +105,7 @@ def _number(path: Path, field: str | None = None) -> int:
 
 
 def _slurm_memory(environment: Mapping[str, str]) -> int | None:
-    """Return the bytes that a Slurm job asked for on this machine, which Slurm states in megabytes."""
+    """Return the bytes that a Slurm job requested on this machine; Slurm states megabytes."""
     with suppress(KeyError, ValueError):
         return int(environment["SLURM_MEM_PER_NODE"]) << 20 or None
     for each, count in (("CPU", "SLURM_CPUS_ON_NODE"), ("GPU", "SLURM_GPUS_ON_NODE")):

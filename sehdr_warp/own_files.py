@@ -77,7 +77,7 @@ def list_file(temporary: Path, path: Path) -> None:
         if os.write(handle, line) < len(line):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
     except OSError:
-        if os.fstat(handle).st_size == 0:  # It was made for nothing.
+        if os.fstat(handle).st_size == 0:  # The list is new and holds nothing.
             file.unlink(missing_ok=True)
         raise
     finally:

@@ -1,7 +1,7 @@
 """The process of a command line: its signals, its standard streams, its locale and working directory.
 
 A failed write to standard error is ignored, because messages about the work must not end the work. A failed write to
-standard output, which was asked for, is an error of one line.
+standard output is an error of one line, because the user asked for that output.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ from typing import Any, TextIO
 from .errors import SehdrError
 
 _SOON = 3.0  # Seconds within which another Ctrl-C says nothing new
-_LIBRARIES = 400_000  # About as many objects as torch's and Warp's modules are
+_LIBRARIES = 400_000  # Objects of torch's and Warp's modules, about
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of malloc.h
 _IMPORTS = "<frozen importlib._bootstrap>"  # File of the frames of an import
 _POOLS = os.path.join("concurrent", "futures", "thread.py")  # Of those of a thread pool
@@ -64,7 +64,7 @@ def prepare() -> None:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
-        except OSError:  # The next file that is opened would be taken for it. What is asked for must still fail.
+        except OSError:  # The next file that is opened would take its number. A write of results must still fail.
             _lead_nowhere(number, os.O_WRONLY if name == "stderr" else os.O_RDONLY)
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))

@@ -15,14 +15,14 @@ _silenced: dict[int, tuple[int, int | None]] = {}
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
-    """Discard what is written to file descriptor 2 meanwhile; exceptions pass."""
+    """Discard what is written to file descriptor 2 within the block; exceptions pass."""
     with _silent(2):
         yield
 
 
 @contextmanager
 def silent_output() -> Iterator[None]:
-    """Discard what is written to descriptors 1 and 2 meanwhile, and what C's streams hold back until the end."""
+    """Discard what is written to descriptors 1 and 2 within the block, also what C streams buffer."""
     with _silent(1), _silent(2):
         try:
             yield

@@ -211,7 +211,7 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
     `data` are arguments of load_scene().
 
     Returns:
-        The plan; None if `count` is None and one training does.
+        The plan; None if `count` is None and one training is enough.
 
     Raises:
         InputError: If the set cannot be divided, or nothing can be shared between its blocks.
@@ -238,7 +238,7 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
         division = largest_count(scene.name, cameras, points, count) if count > 1 else None
         if division is None:
             reason = "its photos do not show different places" if count > 1 else "its photos are few enough"
-            log.info("plan: blocks: none: one training does for this set: %s", reason)
+            log.info("plan: blocks: none: one training is enough for this set: %s", reason)
             return None
     else:
         division = divide(scene.name, cameras, points, count)

@@ -113,7 +113,7 @@ class ShownPlaces:
 
 
 def thin_out(points: np.ndarray, photos: int) -> np.ndarray:
-    """Return every nth of points [P, 3], as many as describe a number of photos."""
+    """Return every nth of points [P, 3], enough to describe a number of photos."""
     most = min(max(FEWEST_PLACES, PLACES_PER_PHOTO * photos), MOST_PLACES)
     return every_nth(points, most)
 
@@ -173,7 +173,7 @@ def _divide(name: str, coverage: ShownPlaces, count: int) -> Division:
 
 
 def _cut(name: str, coverage: ShownPlaces, axes: np.ndarray, shares: np.ndarray) -> Division:
-    """Divide photos into blocks whose cores have stated shares of the photos' middles."""
+    """Divide photos into blocks whose cores hold fractions `shares` of the photos' middles."""
     middles, places = coverage.middles @ axes.T, coverage.points @ axes.T
     cells = _split(name, middles, Cell(np.full(3, -np.inf), np.full(3, np.inf)), shares)
     low, high = np.quantile(places, [0.02, 0.98], axis=0)

@@ -60,7 +60,7 @@ def train_in_blocks(
         overwrite: Replace a training in blocks in `out`.
 
     Returns:
-        The merged run; None if `count` is None and one training does for the set.
+        The merged run; None if `count` is None and one training is enough for the set.
 
     Raises:
         InputError: If the folder is in use, the set cannot be divided, or a resumed training differs.
@@ -118,7 +118,7 @@ def _is_merged(out: Path, plan: BlockPlan, device: torch.device) -> bool:
 
 
 def _continue(out: Path, data: LoadArguments, config: Config, count: int | None) -> BlockPlan:
-    """Return the plan of a training in blocks to continue; raise InputError if something else was asked for."""
+    """Return the plan of a training in blocks to continue; raise InputError if the options differ."""
     plan = BlockPlan.read(out)
     for index in range(len(plan.blocks)):
         refuse_links(folder_of(out, plan, index), out)

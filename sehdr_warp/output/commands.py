@@ -33,7 +33,7 @@ class WorldOptions:
     up: str | None = None
     """Up direction in the photos' coordinates, if the photos do not show it: x,y,z, or an axis such as -y."""
     scale: float | None = None
-    """Meters for each unit of the scene; by default as kept by the viewer, else by GPS, else 1; of axes scene 1."""
+    """Meters for each unit of the scene; by default that set in the viewer, else by GPS, else 1; of axes scene 1."""
 
 
 @dataclass(frozen=True)
@@ -331,7 +331,7 @@ class Meter:
     run: Positional[Path]
     """Folder of a run."""
     view: str | None = None
-    """View in which the reading was taken. Without it, the unit that is kept is printed."""
+    """View in which the reading was taken. Without it, the unit of the run is printed."""
     pixel: str | None = None
     """x,y of the place from the upper left corner, in the size that the run has the view in."""
     luminance: float | None = None
@@ -353,7 +353,7 @@ def run_meter(args: Meter) -> None:
         of_readings = "--pixel", "--luminance", "--illuminance", "--reflectance"
         if flags := [flag for flag in changed_flags(args) if flag in of_readings]:
             raise UsageError(f"{flags[0]}: needs the view of the reading; name it with --view")
-        print(read_light_unit(run) or "no unit is kept: radiance is relative")
+        print(read_light_unit(run) or "no unit is set: radiance is relative")
         return
     if args.pixel is None:
         raise UsageError(f"--view {args.view}: needs the place of the reading; add --pixel x,y")

@@ -153,7 +153,8 @@ def _emor(path: Path, text: str, selector: str | None) -> Response:
     axis, mean, *bends = rows
     weights = _numbers(path, (selector or "").replace(",", " "))
     if len(weights) > len(bends) or not np.isfinite(weights).all():
-        raise InputError(path, f"{selector!r} is not up to {len(bends)} finite numbers", "separate them by commas")
+        problem = f"selector {selector!r} is not a list of up to {len(bends)} finite numbers"
+        raise InputError(path, problem, "separate coefficients by commas, as emor.txt:0.5,-0.1")
     curve = (mean + weights @ np.array(bends[: len(weights)]).reshape(-1, len(mean))).clip(0.0, 1.0)
     inverse = text.lstrip().startswith("B")
     name = ("invemor" if inverse else "emor") + (f":{selector}" if selector else "")

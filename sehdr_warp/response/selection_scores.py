@@ -168,7 +168,7 @@ def minus_log_prior(response: Response, *, from_camera: bool) -> float:
 
 @cache
 def family_curves() -> CurveTables:
-    """Return 512 curves drawn from the family's prior; code 128 means what it does by `camera`."""
+    """Return 512 curves drawn from the family's prior; code 128 has the exposure that it has by `camera`."""
     z = np.maximum(GRID, 1 / 255)
     terms = np.stack([np.log(z), np.log(z + TOE), -np.log(1 + SHOULDER - z)])
     rises = np.stack([1 / z, 1 / (z + TOE), 1 / (1 + SHOULDER - z)])

@@ -47,7 +47,7 @@ def run_config(args: ShowConfig) -> None:
 
 def _cost(config) -> str:
     """Describe the amount of work of a training."""
-    planned = "as many steps as the photos deserve, up to" if config.plan.enabled else "steps:"
+    planned = "steps planned from the photos, up to" if config.plan.enabled else "steps:"
     parts = {
         f"{planned} {config.schedule.iterations}": True,
         f"up to {config.densification.cap_max:,} Gaussians": True,

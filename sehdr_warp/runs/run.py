@@ -391,4 +391,4 @@ def ensure_confidence(run: Run, scene: Scene) -> None:
     try:
         write_confidence(run.folder, evidence, run.checkpoint_hash)
     except SehdrError as error:
-        log.warning("confidence is not kept: %s", error)
+        log.warning("the confidence was not saved: %s", error)

@@ -91,7 +91,7 @@ class Confidence(NamedTuple):
 
 
 class RunFolder:
-    """The files of a run, each read when it is asked for.
+    """The files of a run; each is read by a function of its own.
 
     Raises InputError, with the file and the field if there is one, for whatever cannot be read.
 

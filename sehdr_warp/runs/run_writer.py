@@ -115,7 +115,7 @@ class RunWriter(RunFolder):
 
     @contextmanager
     def _lock_held(self) -> Iterator[None]:
-        """Hold the lock meanwhile, and release it if it was not held before."""
+        """Hold the lock within the block, and release it if it was not held before."""
         had_lock = self._lock.is_locked
         self.lock()
         try:

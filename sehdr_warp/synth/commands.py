@@ -1,4 +1,4 @@
-"""The command line of `sehdr-warp synth`: what may be asked for, and the call."""
+"""The command line of `sehdr-warp synth`."""
 
 import logging
 from dataclasses import dataclass

@@ -71,7 +71,7 @@ class OutputOptions:
     tensorboard: bool = False
     """Write TensorBoard event files into the run."""
     view: bool = False
-    """Serve the page of `view` meanwhile, from port 8080."""
+    """Serve the page of `view` during the training, from port 8080."""
     json: bool = False
     """Print the result as JSON on standard output."""
 
@@ -132,7 +132,7 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         if run is not None:
             _print_result(args, run)
             return
-        # One training does for these photos, as --blocks auto found. Its processes get the words without --blocks.
+        # One training is enough, as --blocks auto found. Its processes get the command line without --blocks.
         argv = [w for w, before in zip(argv, ["", *argv], strict=False) if "--blocks" not in (w.split("=")[0], before)]
     if rank_info is not None:
         if gpus not in (1, rank_info.local_count):
@@ -267,7 +267,7 @@ def _uses_blocks(args: Train) -> bool:
 
 
 def _train_blocks(args: Train) -> "Run | None":
-    """Train or resume a run in blocks; None if `auto` finds that one training does, of which nothing is begun."""
+    """Train or resume a run in blocks; None, with nothing begun, if `auto` finds that one training is enough."""
     from ..arguments import parse_pairs
     from ..blocks.block_plan import BlockPlan
     from ..blocks.jobs import check_devices

@@ -167,7 +167,7 @@ def choices(whole: Workload, divided: Workload, blocks: int, memory: float | Non
     Args:
         whole: Size of one training.
         divided: Size of all blocks together, without their overlap.
-        blocks: Number of blocks for the set; 1 for a set that one training does for.
+        blocks: Number of blocks for the set; 1 if one training is enough.
         memory: Bytes of a GPU's memory; None if there is none to compare with.
         gpus: GPUs that may be used on this machine.
     """

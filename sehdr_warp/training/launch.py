@@ -82,7 +82,7 @@ def rank_from_environment() -> RankInfo | None:
     _check_number("LOCAL_RANK", local_rank, 0, local_count - 1)
     if nodes * local_count != count:
         problem = f"{count} ranks on {nodes} nodes, and {local_count} on this one"
-        raise SehdrError(f"{problem}: start as many on each, with --nproc-per-node")
+        raise SehdrError(f"{problem}: start the same number on each, with --nproc-per-node")
     _check_number("GROUP_RANK", node, 0, nodes - 1)
     return RankInfo(rank, count, local_rank, local_count, node, nodes) if count > 1 else None
 

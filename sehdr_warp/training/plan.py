@@ -26,13 +26,13 @@ from .strategies import mcmc_cap
 STEPS_PER_PHOTO = 75
 """Iterations for each photo. With 300, held-out photos of real captures lose up to 2.6 dB and gain at most 0.3 dB: the
 scene fits what moved between the photos and what their poses do not explain."""
-FEWEST_ITERATIONS = 4000  # Of a training with few photos, if the config has as many and a CPU has the time
+FEWEST_ITERATIONS = 4000  # Of a training with few photos, if the config has that number and a CPU has the time
 CPU_SECONDS = 60.0  # Duration of a training on a CPU, if CPU_FEWEST iterations take no longer
 CPU_FEWEST = 1000  # Iterations on a CPU, however long they take
 PRUNE_NEAR_ANGLE = 0.12  # mcmc.prune_near_angle if cameras look all around
 CPU_CAP_DENSITY = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
 GPU_CAP_DENSITY = 240.0
-"""mcmc.cap_density on a GPU if there are more than MANY_PHOTOS photos of a scene that is not large. With as many,
+"""mcmc.cap_density on a GPU if there are more than MANY_PHOTOS photos of a scene that is not large. With more,
 held-out photos get sharper and lose nothing; with fewer, Gaussians fit what single photos show, and lose 0.25 dB.
 Blocks keep the requested value: see BlockPlan.config_of()."""
 MANY_PHOTOS = 20

@@ -51,7 +51,7 @@ class StepGraphs:
     def run(
         self, views: ViewSource, index: int, following: int | None, options: StepOptions, iteration: int
     ) -> StepResult:
-        """Do GradientStep.run() on view `index`; view `following` is fetched meanwhile if photos are streamed."""
+        """Do GradientStep.run() on view `index`; if photos are streamed, fetch view `following` at the same time."""
         step, gaussians = self._step, self._step.field.gaussians
         # Not if Gaussians.surround() has, for those that are rendered but not trained.
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:

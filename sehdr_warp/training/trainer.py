@@ -78,7 +78,7 @@ class Trainer:
         total: Iterations in all.
         large_scene: Whether photos show little of the scene, see scene_facts.is_large().
         batch: Photos of a step, one for each rank; each counts as an iteration.
-        step_batch: Photos of the last step: `batch`, or as many as iterations were left.
+        step_batch: Photos of the last step: `batch`, or fewer if fewer iterations were left.
         seconds: Duration so far, without evaluation, renders for figures that are shown, and checkpoints.
     """
 

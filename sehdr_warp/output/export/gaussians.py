@@ -206,11 +206,11 @@ def loss_in_words(decibels: float) -> str:
 
 
 def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, display_time: float, note: str) -> None:
-    """Measure and log how well Gaussians in the scene's coordinates show the scene; `note` ends the line's views."""
+    """Measure and log how well Gaussians in the scene's coordinates show it; `note` follows the number of views."""
     views = _cameras_to_compare(run)
     where = f"{len(views)} view{'s' * (len(views) != 1)}{note}"
     if not views:
-        log.info("it is not compared with the scene, which has no cameras of its own")
+        log.info("not compared with the scene, because the file has no cameras")
     elif kind == "ldr":
         decibels = agreement(_renderer(gaussians, run, display_time), _photo_renderer(run, display_time), views)
         words = loss_in_words(decibels)

@@ -45,8 +45,8 @@ RESOLUTIONS = 16, 512
 _FEWEST_VIEWS = 2  # Views that must have measured a voxel
 _LEAST_PART = 0.01  # Share of all triangles that a connected part needs to stay
 _CHECKED = 3  # Held-out views that the mesh's depth is compared in
-# Triangles nearer to a Gaussian of a light than so many standard deviations and voxels are left out. Of the Gaussians
-# near a vertex so many are asked, because the nearest one may be small.
+# Triangles are left out that are nearer to a Gaussian of a light than _REACH standard deviations and _CLEAR voxels. Of
+# each vertex the _NEAREST Gaussians are compared, because the nearest one may be small.
 _REACH, _CLEAR, _NEAREST = 2.0, 1.5, 8
 _UPRIGHT = np.cos(np.radians(20))  # Cosine to +Y of the normal of a floor, and of up in a file that may have a floor
 _LEVEL = 1.0  # Degrees to which a floor counts as level

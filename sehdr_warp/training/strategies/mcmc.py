@@ -65,7 +65,7 @@ class McmcStrategy(Strategy):
     def from_config(
         config: Config, pixels: int, camera_positions: Tensor | None = None, *, large_scene: bool = False
     ) -> "McmcStrategy":
-        """Create the strategy of a config for training photos of so many pixels in total."""
+        """Create the strategy of a config for training photos with `pixels` pixels in total."""
         cap_max = mcmc_cap(config, pixels)
         return McmcStrategy(
             schedule=Schedule.from_config(config),
@@ -209,7 +209,7 @@ def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tens
 
 
 def mcmc_cap(config: Config, pixels: int) -> int:
-    """Return the largest number of Gaussians that "mcmc" makes for training photos of so many pixels in total."""
+    """Return the largest number of Gaussians that "mcmc" makes for training photos with `pixels` pixels in total."""
     most, density = config.densification.cap_max, config.mcmc.cap_density
     return min(most, int(density * math.sqrt(pixels))) if density else most
 
