@@ -1,1 +1,1 @@
-"""Photos of HDR truth, exposed as a camera would. Imports no torch."""
+"""Photos of HDR truth, exposed as a camera would."""
