@@ -21,7 +21,6 @@ from .values import LOAD_OPTIONS, LoadArguments
 if TYPE_CHECKING:
     from ..response import Response
     from ..scene import Camera, Scene, View
-    from ..scene.dataparser import PlacedPhoto
     from .config import Config
     from .run import Run, Splats
     from .run_folder import CameraEntry
@@ -86,6 +85,12 @@ class PhotoRequest:
     options: dict[str, Any]  # Further arguments of load_scene(): response, method, candidates, cameras, photo_storage
     cameras: tuple[CameraEntry, ...] = ()  # Of the run that is resumed, if its splits count
 
+    def of_run(self, config: Config, response: Response, cameras: tuple[CameraEntry, ...]) -> PhotoRequest:
+        """Return the request with response, found cameras and splits of a run, so that none of them is decided anew."""
+        placed = [entry.placed for entry in cameras if entry.placed is not None]  # Older runs have none.
+        options = {"response": response_for_loading(config, response), "cameras": placed}
+        return PhotoRequest(self.data, self.options | options, cameras)
+
     def load(self) -> Scene:
         """Load the scene, held out as in the run that is resumed."""
         return with_saved_splits(load_scene_and_log_notes(self.data, **self.options), self.cameras)
@@ -106,11 +111,9 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).exists():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    response = response_for_loading(run.config, run.response)
-    cameras = known_cameras(run.cameras)
-    scene = load_scene_and_log_notes(run.data | {"path": place}, response=response, cameras=cameras)
+    photos = PhotoRequest(run.data | {"path": place}, {}).of_run(run.config, run.response, run.cameras)
     saved = {entry.name: entry.camera for entry in run.cameras}
-    scene = with_saved_splits(in_world_of_run(scene, saved, run.field.normalization.unit, run.path, place), run.cameras)
+    scene = in_world_of_run(photos.load(), saved, run.field.normalization.unit, run.path, place)
     times = {entry.name: entry.exposure_time for entry in run.cameras}
     views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
     scene = replace(scene, views=tuple(views))
@@ -127,11 +130,6 @@ def _name_changed_photos(scene: Scene, run: Run, place: str) -> None:
     if changed := changed_photos(saved, found):
         text = "%s: %d of %d photos are other pictures than in the training of %s (or have other masks): %s"
         log.warning(text, place, len(changed), len(scene.views), run.path, first_names(changed))
-
-
-def known_cameras(entries: Iterable[CameraEntry]) -> list[PlacedPhoto]:
-    """Return the cameras of a run that structure from motion found, for load_scene(); older runs keep none."""
-    return [entry.placed for entry in entries if entry.placed is not None]
 
 
 def in_world_of_run(

@@ -6,7 +6,7 @@ import os
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -17,13 +17,11 @@ from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
-from ..runs.open import PhotoRequest, known_cameras, load_scene_and_log_notes, response_for_loading
+from ..runs.open import PhotoRequest, load_scene_and_log_notes
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
-    from ..runs.config import Config
     from ..runs.run import Run
-    from ..runs.run_writer import RunWriter
 
 log = logging.getLogger(__name__)
 
@@ -163,6 +161,7 @@ def _run_in_rank(argv: list[str]) -> None:
 
 def _train(args: Train, ranks=None) -> None:
     """Train or resume a run, on this rank."""
+    from ..response import Response
     from ..runs.run_writer import RunWriter
     from .machine import precompiling
     from .scene_facts import check_dataset_truth
@@ -178,7 +177,9 @@ def _train(args: Train, ranks=None) -> None:
     data, config = _load_arguments(args, folder.read_info()["data"] if resumes else None), _config(args, saved)
     photos = PhotoRequest(data, config.load_options)
     if saved is not None:
-        photos = _photos_of_run(photos, folder, saved, keeps_splits=args.scene.holdout is None)
+        # create_trainer() refuses another --response than that of the run.
+        photos = photos.of_run(saved, Response.from_dict(folder.read_info()["response"]), folder.read_cameras())
+        photos = photos if args.scene.holdout is None else replace(photos, cameras=())
     check_dataset_truth(data, config)
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     with nullcontext() if device.type != "cpu" else precompiling(config):
@@ -209,16 +210,6 @@ def _train(args: Train, ranks=None) -> None:
     repeated = options_of_run(trainer.run) if output.resume else _named_options(args)
     repeated |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
     _print_result(args, trainer.run, advice_on(trainer, data, repeated))
-
-
-def _photos_of_run(photos: PhotoRequest, folder: "RunWriter", config: "Config", *, keeps_splits: bool) -> PhotoRequest:
-    """Return a request with the response, cameras and splits of a run, so that none of them is decided anew."""
-    from ..response import Response
-
-    # create_trainer() refuses another --response.
-    response, cameras = Response.from_dict(folder.read_info()["response"]), folder.read_cameras()
-    options = {"response": response_for_loading(config, response), "cameras": known_cameras(cameras)}
-    return PhotoRequest(photos.data, photos.options | options, cameras if keeps_splits else ())
 
 
 def _named_options(args: Train) -> dict[str, Any]:
