@@ -124,9 +124,11 @@ def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:
     gaussians = {name: tensor[rows] for name, tensor in gaussians.items()}
     gaussians["means"] = torch.from_numpy(points[order])
     gaussians["log_scales"] = gaussians["log_scales"] + math.log(own.unit / plan.normalization.unit)
+    evidence = folder.read_evidence(checkpoint)
+    if evidence is None:
+        raise InputError(folder.confidence, "is not of the newest checkpoint", "continue with --resume")
     views = folder.read_scene()["views"]
-    evidence = folder.read_evidence(checkpoint).rows(rows)
-    return TrainedBlock(gaussians, evidence, checkpoint.values, info, views, folder.read_summary())
+    return TrainedBlock(gaussians, evidence.rows(rows), checkpoint.values, info, views, folder.read_summary())
 
 
 def _without_far_reaching(blocks: list[TrainedBlock], plan: BlockPlan) -> list[TrainedBlock]:

@@ -21,15 +21,15 @@ picture.
 
 import hashlib
 import json
+import math
 import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel
-from torch import Tensor
 
 from ..errors import InputError, SehdrError
 from ..files import UnreadableError, has_file, refuse_links
@@ -64,7 +64,7 @@ _REMOVE_FILE = "remove this file, which a run does not need, or train again"
 _MAKE_AGAIN = "remove this file; `sehdr-warp report` makes it again from the photos"
 EVIDENCE_TENSORS = {"weight_sum": "seen"} | {name: name for name in ("stops", "clipped", "peak", "clipped_stops")}
 """Name in confidence.safetensors of each field of Evidence."""
-_ADDED = "clipped_stops"  # Older runs have none.
+_MOST_STOPS = 2.5 * MAX_STOPS  # A misfit and a deviation, each at most MAX_STOPS, and rounding
 _Value = TypeVar("_Value")
 
 
@@ -80,14 +80,6 @@ class CameraEntry:
     camera: Camera
     exposure_time: float
     placed: PlacedPhoto | None = None
-
-
-class Confidence(NamedTuple):
-    """Measured on the training photos, for each of N Gaussians: see Evidence."""
-
-    confidence: Tensor  # [N] in [0, 1], confidence in its light
-    clipped: Tensor  # [N] in [0, 1], fraction of clipped values in the photos that show it
-    clipped_stops: Tensor  # [N], at least 0
 
 
 class RunFolder:
@@ -267,41 +259,8 @@ class RunFolder:
             raise newest
         return None
 
-    def read_confidence(self, checkpoint: Checkpoint) -> Confidence | None:
-        """Return what was measured of a checkpoint's Gaussians; None if it was not measured for this checkpoint."""
-        tensors = self._confidence_tensors(checkpoint, Confidence._fields)
-        if tensors is None:
-            return None
-        expected = checkpoint.tensors["gaussians.means"].shape[:1]
-        for name, values in tensors.items():
-            if values.shape != expected:
-                problem = f"{name} has shape {tuple(values.shape)}, not {tuple(expected)}"
-                raise InputError(self.confidence, problem, _MAKE_AGAIN)
-            most = 2 * MAX_STOPS if name == _ADDED else 1
-            if not bool(((values >= 0) & (values <= most)).all()):  # NaN is neither.
-                raise InputError(self.confidence, f"{name} holds values outside of 0 to {most:g}", _MAKE_AGAIN)
-        result = {name: values.float() for name, values in tensors.items()}
-        if _ADDED not in result:  # The most that it can be
-            result[_ADDED] = (-result["confidence"].log2()).minimum(MAX_STOPS * result["clipped"])
-        return Confidence(**result)
-
-    def read_evidence(self, checkpoint: Checkpoint) -> Evidence:
-        """Return the evidence of the training photos for a checkpoint's Gaussians.
-
-        Raises:
-            InputError: If it was not measured for this checkpoint, or is damaged.
-        """
-        names = tuple(EVIDENCE_TENSORS.values())
-        tensors = self._confidence_tensors(checkpoint, names)
-        count = checkpoint.tensors["gaussians.means"].shape[:1]
-        if tensors is None or any(values.shape != count for values in tensors.values()):
-            raise InputError(self.confidence, "is not of the newest checkpoint", "continue with --resume")
-        if _ADDED not in tensors:
-            tensors[_ADDED] = tensors["stops"].minimum(MAX_STOPS * tensors["clipped"])
-        return Evidence(**{field: tensors[name] for field, name in EVIDENCE_TENSORS.items()})
-
-    def _confidence_tensors(self, checkpoint: Checkpoint, names: tuple[str, ...]) -> dict[str, Tensor] | None:
-        """Return the tensors beside a checkpoint; None if there are none, or they are another checkpoint's."""
+    def read_evidence(self, checkpoint: Checkpoint) -> Evidence | None:
+        """Return the evidence of the training photos for a checkpoint's Gaussians; None if there is none for it."""
         from safetensors import SafetensorError, safe_open
 
         path = self.confidence
@@ -313,12 +272,24 @@ class RunFolder:
                 metadata = json.loads((file.metadata() or {}).get("sehdr_warp", "{}"))
                 if metadata != confidence_metadata(checkpoint.values["sha256"]):
                     return None
-                names = tuple(name for name in names if name != _ADDED or name in set(file.keys()))
-                return {name: file.get_tensor(name) for name in names}
+                stored = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
+            if "clipped_stops" not in stored:  # Of an older run: the most that it can be
+                stored["clipped_stops"] = stored["stops"].minimum(MAX_STOPS * stored["clipped"])
+            tensors = {field: stored[name] for field, name in EVIDENCE_TENSORS.items()}
         except PermissionError as error:
             raise UnreadableError(path, error) from None
         except (SafetensorError, OSError, ValueError, KeyError, RuntimeError, RecursionError) as error:
             raise InputError(path, f"is not a file of confidence ({error!s:.200})", _MAKE_AGAIN) from None
+        expected = checkpoint.tensors["gaussians.means"].shape[:1]
+        for name, values in tensors.items():
+            if values.shape != expected:
+                problem = f"{EVIDENCE_TENSORS[name]} has shape {tuple(values.shape)}, not {tuple(expected)}"
+                raise InputError(path, problem, _MAKE_AGAIN)
+            most = {"clipped": 1.0, "stops": _MOST_STOPS, "clipped_stops": _MOST_STOPS}.get(name, math.inf)
+            if not bool(((values >= 0) & (values <= most) & values.isfinite()).all()):
+                problem = f"{EVIDENCE_TENSORS[name]} holds values outside of 0 to {most:g}"
+                raise InputError(path, problem, _MAKE_AGAIN)
+        return Evidence(**tensors)
 
 
 def confidence_metadata(checkpoint_hash: str) -> dict[str, str | int]:

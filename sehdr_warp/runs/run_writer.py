@@ -261,7 +261,7 @@ class RunWriter(RunFolder):
 
 
 def write_confidence(folder: RunFolder, evidence: Evidence, checkpoint_hash: str) -> None:
-    """Write the confidence of a checkpoint's Gaussians, in place of an earlier one.
+    """Write the evidence for a checkpoint's Gaussians, which decides their confidence, in place of an earlier one.
 
     Not only a training does: a report measures what a run lacks, once it has the photos.
     """
@@ -269,7 +269,6 @@ def write_confidence(folder: RunFolder, evidence: Evidence, checkpoint_hash: str
 
     folder.refuse_links()
     tensors = {name: getattr(evidence, field) for field, name in EVIDENCE_TENSORS.items()}
-    tensors["confidence"] = evidence.confidence()
     # One key: safetensors writes several in any order, and the same run is to give the same file.
     metadata = {"sehdr_warp": json.dumps(confidence_metadata(checkpoint_hash), sort_keys=True)}
     data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, metadata)

@@ -32,7 +32,7 @@ def test_a_training_leaves_its_confidence(trained, scene):
     assert torch.equal(confidence, trained.field.confidence)
     assert confidence.shape == (trained.gaussian_count,) and 0 <= confidence.min() < confidence.max() <= 1
     saved = load_file(trained.folder.confidence)
-    assert sorted(saved) == ["clipped", "clipped_stops", "confidence", "peak", "seen", "stops"]
+    assert sorted(saved) == ["clipped", "clipped_stops", "peak", "seen", "stops"]
     confidence_image = trained.render_confidence(scene.test_views[0].camera)
     assert confidence_image.shape == (32, 32) and 0 < confidence_image.max() <= 1
 
@@ -68,18 +68,18 @@ def test_that_of_another_checkpoint_does_not_count(run):
 
 
 @pytest.mark.parametrize(
-    "confidence, problem",
+    "clipped, problem",
     [(torch.zeros(3), "shape"), (None, "outside of 0 to 1"), (b"\x00" * 40, "not a file of confidence")],
     ids=["short", "values", "damaged"],
 )
-def test_damage_is_one_line(run, confidence, problem):
+def test_damage_is_one_line(run, clipped, problem):
     metadata = {"sehdr_warp": json.dumps(confidence_metadata(run.checkpoint_hash))}
-    if isinstance(confidence, bytes):
-        run.folder.confidence.write_bytes(confidence)
+    if isinstance(clipped, bytes):
+        run.folder.confidence.write_bytes(clipped)
     else:
-        values = torch.full_like(run.field.confidence, torch.nan) if confidence is None else confidence
+        values = torch.full_like(run.clipped_share(), torch.nan) if clipped is None else clipped
         stored = load_file(run.folder.confidence)
-        save_file(stored | {"confidence": values}, run.folder.confidence, metadata)
+        save_file(stored | {"clipped": values}, run.folder.confidence, metadata)
     with pytest.raises(InputError, match=problem) as error:
         load_run(run.path)
     assert run.folder.confidence.name in str(error.value) and "report" in str(error.value)
