@@ -15,6 +15,7 @@ from PIL import Image
 from ..errors import InputError
 from ..files import atomic_folder, atomic_path, write_json
 from ..output.images.exr import write_exr
+from ..parallel import prefetch_map
 from ..response import Response
 from ..scene import Camera, Scene, View, codes_of
 from ..subsets import every_nth
@@ -208,10 +209,15 @@ def write_hdr_nerf_scene(
         InputError: for a camera that the layout cannot hold.
     """
     places = {"train": count(), "test": count()}
+
+    def write_photo(photo: tuple[Path, np.ndarray]) -> None:
+        Image.fromarray(codes_of(photo[1], 8)).save(photo[0])
+
     for index, view in enumerate(views):
         (folder / view.split).mkdir(parents=True, exist_ok=True)
-        for k, photo in enumerate(photos):
-            Image.fromarray(codes_of(photo[index], 8)).save(folder / view.split / f"{view.name}_{k}.png")
+        files = [(folder / view.split / f"{view.name}_{k}.png", photo[index]) for k, photo in enumerate(photos)]
+        for _ in prefetch_map(write_photo, files, len(files)):
+            pass
         write_radiance(truth_path(folder, view.split, next(places[view.split])), view.radiance)
     write_tables(folder, views, exposure_times, points)
 
