@@ -150,7 +150,7 @@ class ViewerScene:
     def frame_parts(self, camera: Camera, *, draft: bool = False, clipped: bool = False) -> Iterator[memoryview | None]:
         """Render a camera as half floats, row by row.
 
-        The planes are [H, W, 4] exposure at the base time and confidence (1 in a draft, or if unknown), [H, W] depth,
+        The planes are [H, W, 4] exposure at the base time and confidence (1 in a draft, -1 if unknown), [H, W] depth,
         and with `clipped` [H, W] the share of clipped values.
 
         Yields:
@@ -177,8 +177,9 @@ class ViewerScene:
                     with self.lock.rendering():
                         assert shares is not None
                         frame[5].copy_(run.field.render_mean(camera, shares)).clamp_(0, _HALF_MOST)
-                elif (confidence := self.render_confidence(camera)) is not None:
-                    picture[..., 3] = torch.as_tensor(confidence)
+                else:
+                    confidence = self.render_confidence(camera)
+                    picture[..., 3] = -1.0 if confidence is None else torch.as_tensor(confidence)
         if frame.is_cuda:  # Into pages that the device writes to itself: several times as fast
             frame = torch.empty(frame.shape, dtype=frame.dtype, pin_memory=True).copy_(frame)
         yield frame.numpy().data.cast("B")

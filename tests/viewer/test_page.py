@@ -81,6 +81,25 @@ def test_exposure_probe_and_saved_exr_agree(chromium, serve, tmp_path):
         assert "radiance" in probe_text and "%" in probe_text and "EV" in probe_text
 
 
+SLOW = "const ask_ = fetch; fetch = (...all) => new Promise(done => setTimeout(done, 900)).then(() => ask_(...all));"
+
+
+def test_a_page_whose_scene_is_not_there_yet_says_so_and_takes_no_input(chromium, serve):
+    with page_of(chromium, serve(count=2).url, script=SLOW) as page:
+        assert page.inner_text("#told") == "the scene is being read …"
+        page.keyboard.press("]")
+        page.mouse.move(200, 200)
+        page.mouse.down()
+        page.mouse.move(260, 220)
+        page.mouse.up()
+        page.wait_for_selector(FULL)
+        assert page.input_value("#stops") == "0"
+        names = page.evaluate(
+            "runs.map((run, i) => { run.name = `/home/me/${'ab'[i]}/scene.ply`; return run; }).map(label)"
+        )
+        assert names == ["a/scene.ply", "b/scene.ply"]
+
+
 def test_looks_overlays_and_the_photo_beside(chromium, serve):
     server = serve(count=2)
     run = server.viewer.runs[0].run

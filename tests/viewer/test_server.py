@@ -74,6 +74,8 @@ def test_a_frame_is_the_render(serve):
     assert (clipped == 0.25).all() and clipped.size == 33 * 21
     draft, _, none = frame(server, view, draft=True)
     assert (draft[..., 3] == 1).all() and not none.size
+    run.render_confidence = lambda camera: None
+    assert (frame(server, view)[0][..., 3] == -1).all(), "as of a file"
 
 
 def test_the_page_its_facts_and_photos(serve):

@@ -24,12 +24,13 @@ async function start() {
     option.textContent += " (needs WebGL2)";
   }
   document.title = facts.scene + " \u00b7 sehdr-warp";
+  document.body.inert = false;
   camera = new FlyingCamera(facts.up);
   facts.views.forEach((view, i) => $("view").add(new Option(`${view.name} (${view.split})`, i)));
   runs.forEach((run, i) => {
-    $("run").add(new Option(run.name, i));
-    if (runs.length > 1) $("left").add(new Option(run.name, "run" + i));
-    $("merge").add(new Option(run.name, i));
+    $("run").add(new Option(label(run), i));
+    if (runs.length > 1) $("left").add(new Option(label(run), "run" + i));
+    $("merge").add(new Option(label(run), i));
   });
   $("runRow").hidden = $("mergeRow").hidden = runs.length < 2;
   $("edit").hidden = $("lights").hidden = $("share").hidden = told.training;
@@ -38,6 +39,12 @@ async function start() {
   useRun(0);
   new ResizeObserver(resize).observe(stage);
   home();
+}
+// The path of a run without the folders that all runs share.
+function label(run) {
+  const paths = runs.map(each => each.name.split("/")), [first] = paths;
+  const differs = first.findIndex((part, i) => paths.some(path => i === path.length - 1 || path[i] !== part));
+  return run.name.split("/").slice(differs).join("/");
 }
 const home = () => jump(facts.opening && facts.views.length ? nearestView(facts.opening) : facts.first, facts.opening);
 // The photo that was taken nearest to a camera, in about its direction.
@@ -71,6 +78,9 @@ function useRun(index) {
   Object.assign(state, {run: index, merged: facts.merged});
   offer();
   $("findLights").disabled = !facts.clipped;
+  const noPhotos = !facts.views.length;  // As of a file
+  for (const id of ["view", "asPhoto", "frusta"]) $(id).disabled = noPhotos;
+  for (const [id, value] of [["left", "photo"], ["overlay", "error"]]) $(id).querySelector(`[value=${value}]`).disabled = noPhotos || !light.gl;
   measured();
   expose();
 }
@@ -177,7 +187,7 @@ function paint() {
   $("whiteTold").textContent = stopsText(Number($("white").value));
   $("handle").hidden = left === "0";
   $("handle").style.left = 100 * state.split + "%";
-  [left === "photo" ? view.name : left.startsWith("run") ? runs[Number(left.slice(3))].name : "", runs.length > 1 ? facts.name : "scene"]
+  [left === "photo" ? view.name : left.startsWith("run") ? label(runs[Number(left.slice(3))]) : "", runs.length > 1 ? label(facts) : "scene"]
     .forEach((name, i) => { $("handle").children[i].textContent = name; });
   probe();
 }
@@ -230,7 +240,7 @@ function probe() {
     const [r, g, b, sure] = value, time = facts.base_time, l = luminance(value) * facts.grey * 2 ** state.stops;
     rows.push(["radiance", [r, g, b].map(x => figure(x / time)).join("&ensp;")]);
     rows.push(["from grey", l > 0 ? stopsText(Math.log2(l / 0.18)) : "\u2013"]);
-    rows.push(["confidence", drawn.draft || side === "other" ? "\u2013" : `${Math.round(100 * sure)} %`]);
+    rows.push(["confidence", drawn.draft || side === "other" || sure < 0 ? "\u2013" : `${Math.round(100 * sure)} %`]);
     rows.push(["depth", figure(light.value("depth", ...at)[0])]);
     state.probed = [r, g, b].map(x => x / time);
   } else for (const name of ["radiance", "from grey", "confidence", "depth"]) rows.push([name, "\u2013"]);
