@@ -122,7 +122,7 @@ def _visible_points(cameras: Sequence[Camera], run: "RenderableScene", up: np.nd
     ceiling, points, colors = max(float(camera.position @ up) for camera in views), [], []
     for camera in views:
         small = camera.resized(_SAMPLES, max(1, round(_SAMPLES * camera.height / camera.width)))
-        rendered = run.render(small)
+        rendered = run.render(small, average=False)  # Points alone are read from it.
         depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)
         row, column = np.nonzero((depth > 0) & (alpha > 0.9))
         points.append(small.unproject(column + 0.5, row + 0.5, depth[row, column]))
