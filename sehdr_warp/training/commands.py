@@ -130,8 +130,7 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         if run is not None:
             _print_result(args, run)
             return
-        # One training is enough, as --blocks auto found. Its processes get the command line without --blocks.
-        argv = [w for w, before in zip(argv, ["", *argv], strict=False) if "--blocks" not in (w.split("=")[0], before)]
+        argv = _without_blocks(argv)  # One training is enough, as --blocks auto found.
     if rank_info is not None:
         if gpus not in (1, rank_info.local_count):
             raise UsageError(f"--gpus {gpus}, but {rank_info.local_count} ranks were started; leave it out")
@@ -148,6 +147,12 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         launch(gpus, _run_in_rank, list(argv))
     else:
         _train(args)
+
+
+def _without_blocks(argv: Sequence[str]) -> list[str]:
+    """Return a command line without `--blocks auto` or `--blocks=auto`."""
+    pairs = zip(argv, ["", *argv], strict=False)
+    return [word for word, before in pairs if before != "--blocks" and word.partition("=")[0] != "--blocks"]
 
 
 def _run_in_rank(argv: list[str]) -> None:
