@@ -45,7 +45,7 @@ def job_watcher() -> SlurmInfoWatcher:
         query = subprocess.run(["sacct", "--noheader", "--starttime=now"], capture_output=True, timeout=_ASKS)
         if query.returncode == 0:
             return SlurmInfoWatcher(delay_s=LONGEST)
-    log.info("SLURM keeps no accounts here: states of jobs come from squeue")
+    log.info("SLURM accounting is off here: states of jobs are read from squeue")
     return QueueWatcher(delay_s=LONGEST // 10)
 
 

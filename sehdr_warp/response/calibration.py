@@ -120,7 +120,8 @@ def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
     start = hat[codes]
     start *= (start > 0).sum(0) >= 2
     if (start > 0).any(0).sum() < 256:
-        raise InputError(name, "hardly a pixel is well exposed in two photos", "give photos of closer exposure times")
+        problem = "fewer than 256 pixels are well exposed in two photos"
+        raise InputError(name, problem, "give photos of closer exposure times")
     # Second derivatives of the curve over nearly the logit of the code, on which cameras' curves are almost straight;
     # each with the root of its step, so that squares sum to an integral.
     axis = np.log((_CODES + 1.0) / (280.0 - _CODES))

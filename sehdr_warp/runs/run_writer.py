@@ -280,7 +280,7 @@ def _refuse_foreign(folder: Path) -> None:
     """Raise InputError if a folder with the name of a new run holds something that a training does not write."""
     for path in sorted(folder.rglob("*")):
         if not _NEW_NAMES.fullmatch(path.relative_to(folder).as_posix()):
-            raise InputError(path, "is in the place of a new run, but is not of one", "move it away")
+            raise InputError(path, "lies in the folder of a new run, but is no file of a run", "move it away")
 
 
 def _identity(file: Path) -> tuple[int, int] | None:

@@ -105,13 +105,13 @@ def installed_versions() -> str:
 def device_of_rank(rank: int, device: str | None) -> torch.device:
     """Return the device of a rank, by its number on its node: a GPU of its own, or the CPU if named or without GPUs."""
     if device not in (None, "cpu", "cuda"):
-        raise InputError(f"device {device}", "is one, and each rank takes its own", "use cpu or cuda, or leave it out")
+        raise InputError(f"device {device}", "names one GPU, and each rank uses its own", "use cpu or cuda")
     if device == "cpu" or (device is None and not torch.cuda.is_available()):
         if rank >= (most := max(2, os.cpu_count() or 1)):
             raise SehdrError(f"{rank + 1} ranks on {os.cpu_count()} processors: start {most} at most")
         return torch.device("cpu")
     if (there := torch.cuda.device_count()) <= rank:
-        raise SehdrError(f"rank {rank} finds {there} GPUs: start as many ranks as there are, or give --device cpu")
+        raise SehdrError(f"rank {rank} finds {there} GPUs: start one rank for each GPU, or add --device cpu")
     return torch.device("cuda", rank)
 
 

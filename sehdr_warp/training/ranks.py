@@ -180,8 +180,8 @@ class Ranks:
         different = [name for name, same in zip(tensors, (least == most).tolist(), strict=True) if not same]
         if different:
             raise SehdrError(
-                f"iteration {iteration}: {different[0]} is no longer the same on all ranks: memory or a GPU is broken, "
-                "or they are of different kinds; --resume continues from the last checkpoint, --gpus 1 on one"
+                f"iteration {iteration}: {different[0]} differs between ranks: memory or a GPU is faulty, or the "
+                "GPUs are of different models; --resume continues from the last checkpoint, with --gpus 1 on one GPU"
             )
 
     def broadcast_object(self, value: Any = None) -> Any:

@@ -224,7 +224,7 @@ class TrainingViews:
             return photos
         limit = MAX_MEMORY_PART * torch.cuda.mem_get_info(device)[0]
         if where in ("memory", "disk") or (where == "auto" and photos.bytes > limit):
-            log.info("plan: photos: %s go to %s one by one, a step ahead", format_bytes(photos.bytes), device)
+            log.info("plan: photos: %s are copied to %s one by one, a step ahead", format_bytes(photos.bytes), device)
             try:
                 return PhotoStream(photos) if self._use_cuda_graph else photos
             except ValueError as error:

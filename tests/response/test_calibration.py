@@ -109,7 +109,7 @@ def test_useless_stacks_get_one_line(tmp_path):
         (good, (1.0, 1.0, 1.0), "same exposure time"),
         (good, times[::-1], "darker than one of shorter"),
         (moved, times, "contradict each other"),
-        (black, times, "hardly a pixel is well exposed"),
+        (black, times, "fewer than 256 pixels are well exposed"),
         ([*good[:2], good[2][:50]], times, "differ in size"),
         (good, None, "state no exposure times"),
     )):  # fmt: skip

@@ -111,7 +111,7 @@ def test_another_programs_folder_of_that_name_is_left_alone(tmp_path):
     (tmp_path / ".new" / "thesis.txt").write_text("mine")
     before = files_in(tmp_path)
     for how in ({"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}):
-        with pytest.raises(InputError, match=r"thesis\.txt: is in the place of a new run"):
+        with pytest.raises(InputError, match=r"thesis\.txt: lies in the folder of a new run"):
             RunWriter(tmp_path).prepare(**how)
     assert {name: text for name, text in files_in(tmp_path).items() if name != ".lock"} == before
 
