@@ -13,6 +13,8 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.model.baking import sphere_directions
 from sehdr_warp.model.lights import LightShape
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
+from sehdr_warp.output.lighting.lights import lights_as_received
+from sehdr_warp.output.lighting.map_center import MapCenter
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.images.hdr_files import read_exr_channels
 
@@ -118,7 +120,7 @@ class StoredLight:
     """Light of a training at the places of its scene's maps, in the truth's unit.
 
     maps: [H, W, 3] of each place. rest: the same without the lights; empty if the run does not state what clipped.
-    lights: shapes in the scene's coordinates, each with its radiance [3].
+    lights: shapes in the scene's coordinates, each with its radiance [3] for the first place.
     """
 
     maps: list[np.ndarray]
@@ -140,7 +142,7 @@ def store_light(path: Path, run: Any, maps: Sequence[LightMap], cameras: Sequenc
         lights = run.find_lights()
         members = [light.members for light in lights]
         arrays |= {f"rest_{i}": scale * rendered_map(run, each, focal, members) for i, each in enumerate(maps)}
-        for light in lights:
+        for light in lights_as_received(run, lights, MapCenter(maps[0].position, 0.0)):
             shape = {"kind": light.shape.kind, "position": light.shape.position.tolist(), "size": light.shape.size}
             radiance = (scale * np.asarray(light.radiance, float)).tolist()
             rows.append(shape | {"axes": light.shape.axes.tolist(), "radiance": radiance})

@@ -31,6 +31,7 @@ from .study import run
 
 LOG = logging.getLogger("relight")
 SIZE, SAMPLES, DEPTH = 96, 256, 3  # Pixels of a ball, paths of a pixel, and surfaces of a path
+FINER = 8  # Rows of Mitsuba's map for each of ours
 RADIUS, DISTANCE = 0.05, 0.6  # Meters: of a ball, and from the balls to the camera
 SHOWN = ("lamps", "night", "window"), (1, 2, 3)
 """Rooms and exposures that are compared."""
@@ -103,7 +104,10 @@ def balls(
     """
     visible_light = np.maximum(radiance, 0) * place.coverage[..., None]
     scene: dict[str, Any] = {"type": "scene", "integrator": {"type": "path", "max_depth": DEPTH}}
-    scene["map"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(visible_light, np.float32))}
+    # Mitsuba has the middle of a map's first row at the pole, so coarse rows near it give too little light: in 64 rows,
+    # a lamp at 13 degrees from the pole has 0.91 of its light.
+    fine = np.kron(visible_light, np.ones((FINER, FINER, 1)))
+    scene["map"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(fine, np.float32))}
     for index, (shape, light) in enumerate(lights):
         scene[f"light_{index}"] = _emitter(mi, shape, light, place.position)
     weight = solid_angles(place.coverage.shape[1], "latlong") * place.coverage

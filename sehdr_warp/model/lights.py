@@ -21,8 +21,9 @@ LEAST_SEEN = 0.3  # Pixels of blending weight over all views, likewise
 REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
 FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
-LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras
+LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras, if nothing hides the light from there
 MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
+UNOBSTRUCTED = 0.5  # Of what most views show of a light: those that show less count as obstructed
 MOST_LIGHTS, MOST_VIEWS = 64, 24  # MOST_VIEWS of the longest exposures, and of those of half of these or less
 LEAST_ROWS, MOST_ROWS = 128, 724
 """Rows of the map in which the light at a point is measured: as fine as the photos' pixels, within these bounds. In
@@ -46,14 +47,16 @@ class LightShape:
     size: tuple[float, float]
 
     def solid_angle(self, point: np.ndarray) -> float:
-        """Return the solid angle that a point sees of a light that is small for it; 0 from behind a rectangle."""
-        towards = point - self.position
-        distance = max(float(np.linalg.norm(towards)), 1e-12)
+        """Return the solid angle that a point sees of a light; 0 from behind a rectangle, 2 pi within a sphere."""
+        towards = self.axes @ (point - self.position)
         if self.kind == "sphere":
-            area = np.pi * (self.size[0] / 2) ** 2
-        else:
-            area = self.size[0] * self.size[1] * max(float(self.axes[2] @ towards) / distance, 0.0)
-        return min(float(area) / distance**2, 2 * np.pi)
+            sine = min(self.size[0] / 2 / max(float(np.linalg.norm(towards)), 1e-12), 1.0)
+            return float(2 * np.pi * sine**2 / (1 + np.sqrt(1 - sine**2)))
+        if towards[2] <= 0:
+            return 0.0
+        u, v = (towards[i] + np.array([0.5, -0.5]) * self.size[i] for i in (0, 1))
+        corners = np.arctan2(np.outer(u, v), towards[2] * np.sqrt(u[:, None] ** 2 + v**2 + towards[2] ** 2))
+        return float(corners[0, 0] - corners[0, 1] - corners[1, 0] + corners[1, 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +65,14 @@ class Light:
 
     Attributes:
         shape: its place and size.
-        radiance: [3] in the field's colors; with the shape it gives the light that the training views show. If each of
-            these cuts the light off at its border, it is what reaches the place of the one that shows most of it.
+        radiance: [3] in the field's colors; with the shape it gives the light that training views show, of those
+            from which nothing hides it. If each view cuts the light off at its border, it is what reaches the place of
+            the one that shows most of it.
         lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
         deviation: of log2 radiance, stops, of what photos clip; None if that was not measured. Edges and colors that do
             not clip do not count, because all its photos may err alike; where photos of half the exposure or less do
             not clip, it is at most MEASURED_STOPS, or what the scene differs from unclipped values.
-        share: of the light that reaches the middle of the training cameras.
+        share: of the light that reaches the middle of the training cameras, with what hides it from there.
         members: [K] int64, its Gaussians.
     """
 
@@ -83,6 +87,27 @@ class Light:
 def light_name(index: int) -> str:
     """Return the name of the light at an index of find_lights(), as files, tables, reports and the viewer have it."""
     return f"light_{index}"
+
+
+@torch.no_grad()
+def received_light(
+    field: RadianceField, position: np.ndarray, focal: float, *, beyond: float = 0.0, degree: int | None = None
+) -> Tensor:
+    """Return [N, 3], what a point receives of each Gaussian: radiance times the solid angle that nothing hides.
+
+    Args:
+        field: a trained scene.
+        position: [3] of the point, scene coordinates.
+        focal: focal length of the photos, pixels.
+        beyond: Gaussians nearer than this are left out; scene units.
+        degree: of the harmonics; by default all.
+    """
+    opacities = None
+    if beyond:
+        place = torch.tensor(field.normalization.points(position), dtype=torch.float32)
+        distance = (field.gaussians.means - place.to(field.gaussians.means.device)).norm(dim=1)
+        opacities = field.gaussians.opacities() * (distance * field.normalization.unit >= beyond)
+    return _view_sums(field, _panorama(position, focal), degree, opacities)[2]
 
 
 @torch.no_grad()
@@ -145,7 +170,8 @@ def find_lights(
     doubt = -confidence[members].clamp_min(2.0**-8).log2().cpu().numpy()
     shares = clipped.to(members.device)[members].cpu().numpy()
     covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
-    total = max(float(_view_sums(field, _panorama(middle, focal), degree)[2].mean(1).sum()), 1e-30)
+    reaches_middle = received_light(field, middle, focal, degree=degree).mean(1)
+    total = max(float(reaches_middle.sum()), 1e-30)
     lights = []
     for group in _groups(positions, REACH * float(np.median(widths))):
         if weights[group] @ certain[group] < CLIPPED * weights[group].sum():
@@ -160,6 +186,10 @@ def find_lights(
             best = int(np.argmax(covered[:, group].sum(1) * (angles_of_shape > 0)))
             part = [values[members][group].cpu().numpy().sum(0) for values in sums_around(best)[1:]]
             holding, area_sums, light_sums = np.array([best]), part[0].reshape(1, 1), part[1][None]
+        # Something hides the light from views that show far less of it than others.
+        fractions = area_sums[:, 0] / angles_of_shape[holding]
+        unobstructed = fractions >= UNOBSTRUCTED * np.quantile(fractions, 0.9)
+        area_sums, light_sums, holding = area_sums[unobstructed], light_sums[unobstructed], holding[unobstructed]
         places = [cameras[index].position for index in holding]
         area = float(_fit(shape, area_sums, places)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
@@ -170,16 +200,15 @@ def find_lights(
         if uncertainty is not None:
             clip = np.maximum(shares[group], 1e-6)
             stops = uncertainty[group] / clip
-            unobstructed = area_sums[:, 0] > 0.5 * area * angles_of_shape[holding]  # Else something hides the light.
-            measured = brightness[group] < measurable[holding][unobstructed].max(initial=0.0)
+            measured = brightness[group] < measurable[holding].max()
             # The scene may contradict the photos that measure it.
             misfit = np.maximum(doubt[group] - uncertainty[group], 0) / np.maximum(1 - shares[group], 1e-6)
             stops[measured] = np.minimum(stops, np.maximum(misfit, MEASURED_STOPS))[measured]
             deviation = float(np.average(stops, weights=weights[group] * clip))
-        share = float(radiance.mean() * shape.solid_angle(middle)) / total
-        if share >= LEAST_SHARE:
+        index = members[torch.from_numpy(group).to(members.device)]
+        share = float(reaches_middle[index].sum()) / total
+        if radiance.mean() * shape.solid_angle(middle) >= LEAST_SHARE * total:  # Also if something hides it from there
             bound = np.minimum(white, radiance)
-            index = members[torch.from_numpy(group).to(members.device)]
             lights.append(Light(shape, radiance, bound, deviation, share, index))
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
 
@@ -206,14 +235,16 @@ def _panorama(position: np.ndarray, focal: float) -> Camera:
     return Camera(2 * rows, rows, rows / np.pi, rows / np.pi, rows, rows / 2, pose, "equirectangular")
 
 
-def _view_sums(field: RadianceField, camera: Camera, degree: int | None) -> tuple[Tensor, Tensor, Tensor]:
+def _view_sums(
+    field: RadianceField, camera: Camera, degree: int | None, opacities: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return what a camera receives of each Gaussian: pixels [N], their solid angle [N], and light times it [N, 3]."""
     device = field.gaussians.means.device
     angle = torch.tensor(steradians(camera), dtype=torch.float32, device=device)
     # Sums of small angles stay numbers of about 1.
     unit = float(angle.mean())
     images = torch.stack([torch.ones_like(angle), angle / unit], 2)
-    sums = field.weighted_sums(field.camera_tensors(camera), images)
+    sums = field.weighted_sums(field.camera_tensors(camera), images, opacities)
     radiance = field.radiance_towards(camera.position, degree=degree)
     return sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit)
 

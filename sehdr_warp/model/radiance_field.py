@@ -271,14 +271,14 @@ class RadianceField(nn.Module):
         return self._decoded(self._blended_colors(place.to(self.gaussians.means.device), degree)) / self.base_time
 
     @without_replays()
-    def weighted_sums(self, camera: CameraTensors, images: Tensor) -> Tensor:
+    def weighted_sums(self, camera: CameraTensors, images: Tensor, opacities: Tensor | None = None) -> Tensor:
         """Return [N, C]: for each Gaussian the sum over pixels of its blending weight times images [H, W, C].
 
-        Blending is linear in the features, so this is the adjoint of a render.
+        Blending is linear in the features, so this is the adjoint of a render. `opacities` [N] replace the scene's.
         """
         with torch.enable_grad():
             features = images.new_zeros(self.gaussians.count, images.shape[2]).requires_grad_()
-            blended = self._rasterize(camera, features).image
+            blended = self._rasterize(camera, features, opacities=opacities).image
             # The gradient of a scalar, because checking explicit gradients loads torch's compiler, two seconds.
             return torch.autograd.grad((blended * images).sum(), features)[0]
 

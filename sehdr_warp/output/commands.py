@@ -286,9 +286,9 @@ class Lights:
     """The file: .json, or .usda, with a map of the rest beside it. Without it the lights are only listed."""
     world: WorldOptions = WorldOptions()
     at: str = "center"
-    """Place of the map, as of envmap: that of a CG object, so that what is near it fits."""
+    """Place that is lit, as of envmap: that of a CG object. Lights that something hides from it are dimmer."""
     beyond: float | None = None
-    """Leave out of the map what is nearer than this, as in envmap."""
+    """Leave out what is nearer than this, as in envmap."""
     unseen: Literal["inpaint", "black"] = "inpaint"
     """inpaint: directions of the map that no photo covers get the light around them; alpha still marks them."""
     reference_white: float | None = None

@@ -3,6 +3,7 @@
 import json
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import torch
 
 from ...errors import SehdrError, refuse_paths
 from ...files import atomic_path, check_absent
-from ...model.lights import light_name
+from ...model.lights import Light, light_name, received_light
 from ...scene.wide_camera import typical_focal_length
 from ...subsets import first_names
 from ..cameras.scene_cameras import training_cameras
@@ -25,12 +26,13 @@ from .map_center import MapCenter, find_center
 from .unit import luminance_of_one
 
 if TYPE_CHECKING:
-    from ...runs.run import Run
+    from ...runs.run import RenderableScene, Run
 
 log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".usda")
 UNSEEN = ("inpaint", "black")
 UNCERTAIN = 1.0  # Stops of deviation above which a light is called uncertain
+MOST_GAIN = 4.0  # Of a light's radiance at the lit place; more is an error of its shape, seen from the edge
 MAP_SIZE = 1024  # Pixels across of the map of what is not a light
 _STAGE = """#usda 1.0
 (
@@ -85,11 +87,11 @@ def write_lights(
 ) -> list[Path]:
     """Write the lights of a scene; return the files.
 
-    A light is a group of Gaussians that the photos clipped. With its size, its radiance gives the light that the
-    training views show. A USD file has a SphereLight or RectLight for each, and a DomeLight for everything else: a
-    map as write_environment_map() takes it at the same place, `<stem>_rest.exr`, in which the lights are dark. Its
-    alpha is the coverage by photos. If the unit of the run's light is known, lights and dome are in cd/m^2, as USD has
-    them.
+    A light is a group of Gaussians that the photos clipped. With its size, its radiance gives the light that reaches
+    the place `at` of it, so a lamp whose shade hides it from there is dimmer than in the table. A USD file has a
+    SphereLight or RectLight for each, and a DomeLight for everything else: a map as write_environment_map() takes it at
+    the same place, `<stem>_rest.exr`, in which the lights are dark. Its alpha is the coverage by photos. If the unit of
+    the run's light is known, lights and dome are in cd/m^2, as USD has them.
 
     Args:
         run: From load_run or train.
@@ -97,8 +99,8 @@ def write_lights(
         axes: As in world_transform.
         up: As in world_transform.
         scale: As in world_transform.
-        at: Place of the dome's map, as in write_environment_map(). Lights stay where they are.
-        beyond: Distance within which the map leaves everything out, as there.
+        at: Place that is lit, as in write_environment_map(). Lights stay where they are.
+        beyond: Distance within which everything is left out, as there.
         unseen: "inpaint": directions of the dome that no photo covers get the light around them, so that they do not
             darken what the dome lights. "black": they are black.
         reference_white: Value of the photos' white in the plates that the lights go with, as in render_views; lights
@@ -120,10 +122,10 @@ def write_lights(
     files = [path] if suffix == ".json" else [path, rest]
     for file in files:
         check_absent(file, overwrite)
-    if suffix == ".json" and (at, beyond, unseen) != ("center", None, "inpaint"):
-        raise SehdrError(f"{path}: at, beyond and unseen are of the dome's map, which .json has not; write .usda")
+    if suffix == ".json" and unseen != "inpaint":
+        raise SehdrError(f"{path}: unseen is of the dome's map, which .json has not; write .usda")
     transform = world_transform(run, axes, up=up, scale=scale)
-    center = None if suffix == ".json" else find_center(run, training_cameras(run), at, beyond, transform)
+    center = find_center(run, training_cameras(run), at, beyond, transform)
     factor, unit = exposure_of_white(run, reference_white), "relative radiance"
     if reference_white is not None:
         unit = f"white is {reference_white:g}"
@@ -132,12 +134,12 @@ def write_lights(
         text = "%s: in cd/m^2; a value of 1 in plates is %.4g of them, and --reference-white puts all in one unit"
         log.info(text, path.name, luminance)
     units = f"{unit}, linear Rec.709"
-    lights = run.find_lights()
+    lights = lights_as_received(run, run.find_lights(), center)
     if not lights:
         text = "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest"
         log.warning(text, run.path)
     rows = [_describe(light_name(index), light, transform, factor) for index, light in enumerate(lights)]
-    if center is not None:
+    if suffix == ".usda":
         inpainted = _write_rest(run, rest, lights, transform, axes, center, unseen, overwrite)
         mark = "@@@" if "@" in rest.name else "@"  # USD's quotes of a path
         asset = f"{mark}./{rest.name}{mark}"
@@ -148,10 +150,36 @@ def write_lights(
         text = _STAGE.format(scene=scene, units=json.dumps(units), matrix=matrix, lights=lines)
     else:
         facts = {**provenance(run), "units": units, "axes": axes, "world_matrix": transform.matrix.tolist()}
+        facts["lit_place"] = transform.points(center.position).tolist()
         text = json.dumps({**facts, "lights": rows}, indent=1)
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return files
+
+
+def lights_as_received(run: "RenderableScene", lights: Sequence[Light], center: MapCenter) -> list[Light]:
+    """Return lights with the radiance that gives, with their shapes, the light that a place receives of each.
+
+    A lamp whose shade hides it from there becomes dimmer. A rectangle that faces away stays as it is.
+
+    Args:
+        run: From load_run or train.
+        lights: Its lights.
+        center: Place, and the distance within which everything is left out.
+    """
+    if not lights:
+        return []
+    focal = typical_focal_length(training_cameras(run))
+    received = received_light(run.field, center.position, focal, beyond=center.beyond, degree=run.degree)
+    result = []
+    for light in lights:
+        angle = light.shape.solid_angle(center.position)
+        if angle > 0:
+            radiance = run.in_rec709(received[light.members].sum(0)).cpu().numpy() / angle
+            gain = MOST_GAIN * light.radiance.mean() / max(float(radiance.mean()), 1e-30)
+            light = replace(light, radiance=radiance * min(gain, 1.0))
+        result.append(light)
+    return result
 
 
 def lights_table(lights: Sequence[Any], unit: float | None = None, transform: WorldTransform | None = None) -> str:

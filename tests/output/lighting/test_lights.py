@@ -12,11 +12,14 @@ from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.lights import Light, LightShape
 from sehdr_warp.output.commands import Lights, WorldOptions, run_lights
-from sehdr_warp.output.lighting.environment_map import latlong, write_environment_map
+from sehdr_warp.output.lighting import lights as lighting
+from sehdr_warp.output.lighting.environment_map import latlong, solid_angles, write_environment_map
 from sehdr_warp.output.lighting.lights import lights_table, write_lights
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.runs.run import Splats
+from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
+from sehdr_warp.splats import GaussianArrays
 
 from ..helpers import Entry, camera
 from .test_environment_map import lamps
@@ -35,7 +38,17 @@ def run(tmp_path, monkeypatch):
     cameras = tuple(Entry(str(i), "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0, 0, 9))) for i in range(3))
     scene = Splats(tmp_path / "run", field_of(lamps()), cameras)
     scene.find_lights = lambda: LIGHTS
+    # Lights that reach every place with their radiance.
+    monkeypatch.setattr(lighting, "received_light", lambda field, place, *_, **__: received(place))
     return scene
+
+
+def received(place):
+    """[6, 3] of the Gaussians: the first of each light gives all of its light."""
+    light = torch.zeros(6, 3, dtype=torch.float64)
+    for each in LIGHTS:
+        light[each.members[0]] = torch.from_numpy(each.radiance * each.shape.solid_angle(place))
+    return light
 
 
 def test_json_has_every_figure(tmp_path, run):
@@ -43,7 +56,9 @@ def test_json_has_every_figure(tmp_path, run):
     lights_file = json.loads((tmp_path / "lights.json").read_text())
     first, second = lights_file["lights"]
     assert first["position"] == [1.0, 0.5, 2.0] and first["size"] == [0.4, 0.2] and first["shape"] == "rect"
-    assert first["radiance"] == [8, 4, 2] and first["deviation_stops"] == 0.7 and second["deviation_stops"] is None
+    assert first["radiance"] == pytest.approx([8, 4, 2]) and first["lower_bound"] == [1, 1, 1]
+    assert first["deviation_stops"] == 0.7 and second["deviation_stops"] is None
+    assert lights_file["lit_place"] == pytest.approx([0, 0, 0])
     assert (first["share_of_light"], second["shape"]) == (0.5, "sphere") and "Rec.709" in lights_file["units"]
 
 
@@ -122,11 +137,46 @@ def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
     write_lights(run, tmp_path / "center.usda", unseen="black", axes="scene")
     assert np.abs(read_hdr(tmp_path / "center_rest.exr") - rest).max() > 1
     with pytest.raises(SehdrError, match=r"which \.json has not; write \.usda"):
-        write_lights(run, tmp_path / "lights.json", **place)
+        write_lights(run, tmp_path / "lights.json", unseen="black")
     with pytest.raises(UsageError, match="--at, --beyond: set for a file"):
         run_lights(Lights(run=run.path, at="0,0,1", beyond=1.0))
     with pytest.raises(UsageError, match="--unseen: set for a file"):
         run_lights(Lights(run=run.path, unseen="black"))
+
+
+def test_lights_and_rest_light_a_place_as_its_map_does(tmp_path):
+    """Two lamps; a screen hides one from the place that is lit, though the photos show it."""
+    screen = np.stack(np.meshgrid(np.arange(0.7, 1.5, 0.05), np.arange(-0.4, 0.4, 0.05), [2.0]), 3).reshape(-1, 3)
+    places = np.concatenate([[[2.0, 0, 4]], [[-2.0, 0, 4]], screen])
+    light = np.concatenate([np.full((2, 3), (300.0, 200.0, 100.0)), np.full(screen.shape, 0.2)])
+    widths = np.where(light[:, :1] > 1, 0.06, 0.04)
+    turns = np.tile(np.float32([1, 0, 0, 0]), (len(places), 1))
+    scales = np.float32(np.log(widths)).repeat(3, 1)
+    harmonics = (light[:, None] / 0.28209479).astype(np.float32)
+    opacity = np.full(len(places), 6, np.float32)
+    field = field_of(GaussianArrays(np.float32(places), scales, turns, opacity, harmonics, "linear", 1.0))
+    # Photos from both sides of the place: most see past the screen.
+    eyes = [(x, y, 0.0) for x in (-1.5, -1.0, 1.0, 1.5) for y in (-0.6, 0.6)]
+    poses = [look_at(eye, (0, 0, 4), up=(0, -1, 0)) for eye in eyes]
+    photos = [Camera(160, 120, 100.0, 100.0, 80.0, 60.0, pose) for pose in poses]
+    run = Splats(tmp_path / "run", field, tuple(Entry(str(i), "train", each, 1.0) for i, each in enumerate(photos)))
+    run.clipped_share = lambda: torch.tensor([1.0, 1.0] + [0.0] * len(screen))
+    listed = run.find_lights()
+    assert len(listed) == 2 and listed[0].shape.position[0] < 0 and listed[1].share < 0.05 * listed[0].share
+    assert listed[1].radiance == pytest.approx(listed[0].radiance, rel=0.3)
+    place = np.zeros(3)
+    write_lights(run, tmp_path / "lights.json", axes="scene", at=(0.0, 0.0, 0.0))
+    rows = json.loads((tmp_path / "lights.json").read_text())["lights"]
+    angle = solid_angles(512, "latlong")[..., None] * 4 * np.pi / solid_angles(512, "latlong").sum()
+    options = {"focal_length": 100.0, "pixel_angle": 2 * np.pi / 2048}
+    directions = latlong(2048).astype(np.float32)
+    for light, row in zip(listed, rows, strict=True):
+        images = [
+            run.render_directions(place, directions, without=members, **options).hdr.numpy()
+            for members in ([], [light.members])
+        ]
+        lost = ((images[0] - images[1]).reshape(256, 4, 512, 4, 3).mean((1, 3)) * angle).sum((0, 1))
+        assert np.array(row["radiance"]) * light.shape.solid_angle(place) == pytest.approx(lost, rel=0.1, abs=1e-3)
 
 
 def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):
