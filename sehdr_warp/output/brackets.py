@@ -261,7 +261,7 @@ class BracketWriter:
         digits = len(str(len(pixels) - 1))  # Tools sort files by name.
         for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
             label = f"b{index:0{digits}d}_{exposure.label}"
-            header = options.header.attributes(name, exposure.time, camera, ev=repr(exposure.ev)) | reason
+            header = options.header.attributes(exposure.time, camera, view=name, ev=repr(exposure.ev)) | reason
             parts.append(Part(rgb_channels(image), header, label if options.multipart else ""))
             place = f"{name}/{name}_{label}" if options.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if options.multipart else f"{place}.exr"

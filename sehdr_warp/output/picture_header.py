@@ -45,9 +45,9 @@ class PictureHeader:
         now = datetime.now().replace(microsecond=0)
         return PictureHeader(run.base_time, colorspace, now, facts, luminance_of_one(run))
 
-    def attributes(self, view: str, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
-        """Return the EXR attributes of a picture."""
-        values = {**self.provenance, **provenance, "view": view, "baseExposureTime": repr(float(self.base_time))}
+    def attributes(self, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
+        """Return the EXR attributes of a picture; `provenance` is of this one alone."""
+        values = {**self.provenance, **provenance, "baseExposureTime": repr(float(self.base_time))}
         luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
         return exr_header(self.colorspace, exposure_time, camera, self.captured, values, luminance)
 

@@ -15,7 +15,6 @@ from ..progress import track_progress
 from ..scene import Camera
 from ..scene.exposure.times import shutter
 from ..subsets import evenly, first_names
-from .aovs import data_parts, read_aovs
 from .brackets import Brackets, bracket_exposures, remove_earlier
 from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .cameras.selection import check_cameras, may_move, read_size, select_cameras
@@ -25,7 +24,7 @@ from .images.ldr_files import as_array, quantize, write_picture
 from .images.ocio import ocio_view
 from .images.tonemap import ToneMap, exposure_of_white, fit_tone_map
 from .picture_header import PictureHeader
-from .view_images import ViewImages, render_images
+from .view_images import ViewImages, data_parts, read_aovs, render_images
 from .world_transform import WorldTransform, from_photos, stored_matrix, world_transform
 
 if TYPE_CHECKING:
@@ -148,7 +147,7 @@ def render_views(
             images = render_images(run, view_camera, transform)
             if images.confidence is None and index == 0:
                 log.info("without a confidence channel; for a run, `sehdr-warp report` measures it, from the photos")
-            attributes = header.attributes(name, hdr_exposure, images.camera_in_file)
+            attributes = header.attributes(hdr_exposure, images.camera_in_file, view=name)
             parts = _hdr_parts(images, attributes, colorspace, hdr_exposure, aov_names)
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)

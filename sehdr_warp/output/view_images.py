@@ -1,11 +1,18 @@
-"""Render one view of a scene as arrays on the CPU, in the units and coordinates of files."""
+"""Render one view of a scene as arrays on the CPU: light, coverage, depth, confidence, and the AOVs made of them.
 
+Each AOV is a part of its own in the EXR file, tagged as data.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import SehdrError, did_you_mean
 from ..scene import Camera
+from ..scene.wide_camera import pixel_directions
+from .images.exr import Part, as_data
 from .images.ldr_files import as_array
 from .world_transform import WorldTransform
 
@@ -43,3 +50,100 @@ def render_images(run: "RenderableScene", camera: Camera, transform: WorldTransf
     hdr, alpha, depth = (as_array(values) for values in (view.hdr, view.alpha, view.depth))
     depth = depth * np.float32(transform.scale)
     return ViewImages(run, camera, transform.camera(camera), hdr, alpha, depth, confidence)
+
+
+Channels = Mapping[str, np.ndarray]
+
+
+def _depth(view: ViewImages) -> Channels:
+    """Return Z and the distance from the camera; 0 where nothing is."""
+    depth = view.depth
+    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(view.camera_in_file), axis=2)}
+
+
+def _position(view: ViewImages) -> Channels:
+    points = _points(view)
+    return {f"position.{axis}": points[..., i] for i, axis in enumerate("XYZ")}
+
+
+def _normals(view: ViewImages) -> Channels:
+    """Return surface normals from depth, towards the camera, in the file's axes; 0 where empty and at borders."""
+    points = _points(view)
+    down, right = (np.gradient(points, axis=axis) if points.shape[axis] > 1 else 0 * points for axis in (0, 1))
+    normal = np.cross(down, right)
+    normal *= np.where((normal * (view.camera_in_file.position - points)).sum(2, keepdims=True) < 0, -1, 1)
+    length = np.linalg.norm(normal, axis=2, keepdims=True)
+    # A difference with an empty pixel has no meaning.
+    covered = view.depth > 0
+    whole = np.pad(covered, 1)
+    whole = whole[1:-1, 1:-1] & whole[:-2, 1:-1] & whole[2:, 1:-1] & whole[1:-1, :-2] & whole[1:-1, 2:]
+    normal = np.where(whole[..., None] & (length > 0), normal / np.where(length > 0, length, 1), 0)
+    return {f"N.{axis}": normal[..., i] for i, axis in enumerate("XYZ")}
+
+
+def _alpha(view: ViewImages) -> Channels:
+    return {"A": view.alpha}
+
+
+def _confidence(view: ViewImages) -> Channels:
+    return {"confidence": _require_values(view, "confidence", view.confidence)}
+
+
+def _clipped(view: ViewImages) -> Channels:
+    return {"clipped": _require_values(view, "clipped", view.run.render_clipped(view.camera))}
+
+
+def _require_values(view: ViewImages, name: str, values: Any) -> np.ndarray:
+    """Return the values of an AOV as an array; raise SehdrError if they were not measured."""
+    if values is None:
+        remedy = "`sehdr-warp report` measures it for a run, from the photos; else leave the AOV out"
+        raise SehdrError(f"{view.run.path}: AOV {name} was not measured; {remedy}")
+    return as_array(values)
+
+
+AOVS: Mapping[str, Callable[[ViewImages], Channels]] = {
+    "depth": _depth,
+    "position": _position,
+    "normals": _normals,
+    "alpha": _alpha,
+    "confidence": _confidence,
+    "clipped": _clipped,
+}
+
+
+def read_aovs(names: str | Sequence[str]) -> tuple[str, ...]:
+    """Return names of AOVS from a sequence or a comma-separated list; "all" names all of them.
+
+    Raises:
+        SehdrError: For an unknown or repeated name.
+    """
+    requested = [name.strip() for name in names.split(",") if names] if isinstance(names, str) else list(names)
+    for name in requested:
+        if name not in AOVS and name != "all":
+            names_text = ", ".join(AOVS)
+            raise SehdrError(f"AOV {name!r} is not one of {names_text}, all{did_you_mean(name, AOVS)}")
+    if "all" in requested:
+        return tuple(AOVS)
+    if len(set(requested)) < len(requested):
+        raise SehdrError(f"AOVs {', '.join(requested)}: one is named twice; leave it out")
+    return tuple(requested)
+
+
+def data_parts(names: Sequence[str], view: ViewImages, header: Mapping[str, Any]) -> list[Part]:
+    """Return the parts of a file that hold AOVs of a rendered view; `header` is that of its picture."""
+    return [Part(AOVS[name](view), as_data(header), name) for name in names]
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    """Return [H, W, 3] rays in camera axes, 1 long along the camera's own axis; unit vectors for a wide camera."""
+    if not camera.is_pinhole:
+        return np.nan_to_num(pixel_directions(camera))
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2)
+
+
+def _points(view: ViewImages) -> np.ndarray:
+    """Return [H, W, 3] coordinates of the visible surface in the file; 0 where nothing is."""
+    camera, depth = view.camera_in_file, view.depth[..., None]
+    points = (_rays(camera) * depth) @ camera.world_to_camera[:3, :3] + camera.position
+    return np.where(depth > 0, points, 0)

@@ -3,7 +3,6 @@
 import json
 import logging
 from dataclasses import dataclass, fields
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +14,11 @@ from ...scene import Camera
 from ...scene.wide_camera import typical_focal_length
 from ..cameras.scene_cameras import training_cameras
 from ..images.colorspace import color_space, from_rec709
-from ..images.exr import Part, as_data, exr_header, rgb_channels, write_multipart_exr, write_radiance
+from ..images.exr import Part, as_data, rgb_channels, write_multipart_exr, write_radiance
 from ..images.ldr_files import as_array
 from ..images.tonemap import exposure_of_white
-from ..picture_header import provenance
-from ..world_transform import AXES, WorldTransform, stored_matrix, world_transform
+from ..picture_header import PictureHeader
+from ..world_transform import AXES, WorldTransform, world_transform
 from .map_center import MapCenter, find_center
 from .shares import light_shares
 from .unit import EFFICACY, luminance_of_one
@@ -168,16 +167,12 @@ def map_header(
         exposure: Seconds that radiance was multiplied by.
     """
     facts = {
-        **provenance(run),
         "position": json.dumps(transform.points(center.position).tolist()),
         "axes": axes,
         "beyond": repr(float(f"{center.beyond * transform.scale:.15g}")),  # As stated, but for rounding
-        "worldMatrix": json.dumps(stored_matrix(run, transform).tolist()),
         "mapToWorld": json.dumps(transform.rotation.T.tolist()),
     }
-    luminance = luminance_of_one(run)
-    white_luminance = None if luminance is None else luminance / exposure
-    header = exr_header(colorspace, exposure, None, datetime.now().replace(microsecond=0), facts, white_luminance)
+    header = PictureHeader.of(run, transform, colorspace).attributes(exposure, None, **facts)
     return header | {"envmap": envmap(layout)}
 
 
