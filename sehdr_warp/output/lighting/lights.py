@@ -176,8 +176,10 @@ def lights_as_received(run: "RenderableScene", lights: Sequence[Light], center: 
         angle = light.shape.solid_angle(center.position)
         if angle > 0:
             radiance = run.in_rec709(received[light.members].sum(0)).cpu().numpy() / angle
-            gain = MOST_GAIN * light.radiance.mean() / max(float(radiance.mean()), 1e-30)
-            light = replace(light, radiance=radiance * min(gain, 1.0))
+            gain = float(radiance.mean() / max(light.radiance.mean(), 1e-30))
+            radiance *= min(1.0, MOST_GAIN / max(gain, 1e-30))
+            bound = np.minimum(min(gain, 1.0) * light.lower_bound, radiance)
+            light = replace(light, radiance=radiance, lower_bound=bound)
         result.append(light)
     return result
 

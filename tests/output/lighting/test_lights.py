@@ -176,6 +176,7 @@ def test_lights_and_rest_light_a_place_as_its_map_does(tmp_path):
             for members in ([], [light.members])
         ]
         lost = ((images[0] - images[1]).reshape(256, 4, 512, 4, 3).mean((1, 3)) * angle).sum((0, 1))
+        assert (np.array(row["lower_bound"]) <= row["radiance"]).all()
         assert np.array(row["radiance"]) * light.shape.solid_angle(place) == pytest.approx(lost, rel=0.1, abs=1e-3)
 
 
