@@ -116,6 +116,9 @@ class Render:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
+    from .images.colorspace import color_space
+
+    color_space(args.pictures.colorspace)  # Before anything is loaded
     from .cameras.selection import select_cameras
     from .film import write_film
     from .render_views import render_views
@@ -165,7 +168,7 @@ def _check_render(args: Render) -> None:
         raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
     pictures = dict(vars(args.pictures))
     brackets = [pictures.pop("evs"), pictures.pop("exposures")]
-    del pictures["reference_white"]
+    del pictures["reference_white"], pictures["colorspace"]
     check_options(args.cameras, args.size, pictures.pop("aovs"), brackets != [None, None], **pictures)
     if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")

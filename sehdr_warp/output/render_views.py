@@ -18,7 +18,7 @@ from ..subsets import evenly, first_names
 from .brackets import Brackets, bracket_exposures, remove_earlier
 from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .cameras.selection import check_cameras, may_move, read_size, select_cameras
-from .images.colorspace import color_space, from_rec709
+from .images.colorspace import from_rec709
 from .images.exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
 from .images.ldr_files import as_array, quantize, write_picture
 from .images.ocio import ocio_view
@@ -110,7 +110,7 @@ def render_views(
     refuse_paths("load_run", run)
     has_brackets = evs is not None or exposures is not None
     options = {"multipart": multipart, "ldr_brackets": ldr_brackets, "group_by": group_by, "ocio": ocio, "view": view}
-    check_options(cameras, size, aovs, has_brackets, colorspace=colorspace, pixel=pixel, **options)
+    check_options(cameras, size, aovs, has_brackets, pixel=pixel, **options)
     out = Path(out)
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, size=size, transform=transform, up=up)
@@ -176,7 +176,6 @@ def check_options(
     aovs: str | Sequence[str],
     has_brackets: bool,
     *,
-    colorspace: str,
     pixel: str,
     multipart: bool,
     ldr_brackets: str | None,
@@ -191,7 +190,6 @@ def check_options(
     read_aovs(aovs)
     if not has_brackets and (multipart or ldr_brackets or group_by != "view"):
         raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
-    color_space(colorspace)
     check_pixel_type(pixel)
     if (ocio is None) != (view is None):
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")

@@ -11,6 +11,7 @@ import torch
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.images.tonemap import LUMINANCE, exposure_of_white
+from sehdr_warp.output.lighting import lights
 from sehdr_warp.output.lighting.environment_map import write_environment_map
 from sehdr_warp.output.lighting.lights import lights_table, write_lights
 from sehdr_warp.output.lighting.unit import EFFICACY, meter, read_light_unit
@@ -21,7 +22,7 @@ from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
 
 from ..helpers import AnalyticRun, Entry, camera
 from .test_environment_map import lamps
-from .test_lights import LIGHTS
+from .test_lights import LIGHTS, received
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def run(tmp_path):
 
 
 @pytest.fixture
-def lit(tmp_path):
+def lit(tmp_path, monkeypatch):
     """A scene of six lamps, of which three belong to two lights."""
     cameras = tuple(
         Entry(f"r_{i}", "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0.3, 0.2, 9))) for i in range(3)
@@ -43,6 +44,7 @@ def lit(tmp_path):
     scene = Splats(tmp_path / "lit", field_of(lamps()), cameras)
     scene.path.mkdir()
     scene.find_lights = lambda: LIGHTS
+    monkeypatch.setattr(lights, "received_light", lambda field, place, *_, **__: received(place))
     return scene
 
 
