@@ -7,11 +7,13 @@ That of a masked photo has a second part, of the mask.
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..scene import Scene, View
+from ..scene.photo_names import photo_labels
 from .values import FORMAT
 
 GRID = 8
@@ -25,6 +27,7 @@ _TOLERANCE = 2
 
 def describe_scene(scene: Scene) -> dict:
     """Return what scene.json holds."""
+    sources = [view.source or Path(view.name) for view in scene.views]
     views = [
         {name: getattr(view, name) for name in ("name", "split", "exposure_time")}
         | {
@@ -32,19 +35,19 @@ def describe_scene(scene: Scene) -> dict:
             "has_hdr": view.hdr is not None,
             "photo": photo_signature(view.codes, view.mask),
         }
-        | (_lens_values(view) if scene.format in FOUND else {})
-        for view in scene.views
+        | (_lens_values(view, label) if scene.format in FOUND else {})
+        for view, label in zip(scene.views, photo_labels(sources), strict=True)
     ]
     facts = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
     return {"format": FORMAT, "name": scene.name, "layout": scene.format, **facts, "views": views}
 
 
-def _lens_values(view: View) -> dict:
-    """Return file name and lens of a photo, with which it is read again without structure from motion."""
+def _lens_values(view: View, label: str) -> dict:
+    """Return photo_labels() and lens of a photo, with which it is read again without structure from motion."""
     if view.lens is None or view.source is None:
         return {}
     lens = {name: getattr(view.lens, name) for name in ("model", "width", "height", "params")}
-    return {"lens": lens | {"file": view.source.name}}
+    return {"lens": lens | {"file": label}}
 
 
 class SceneDifference(NamedTuple):
