@@ -42,7 +42,7 @@ def difference(a: wp.vec4, b: wp.vec4) -> float:
 def color_between(
     photos: wp.array(dtype=wp.vec4ub), offset: wp.int64, width: int, height: int, u: float, v: float
 ) -> wp.vec4:
-    """Bilinear, at u, v from the middle of the first pixel; within the photo but for rounding."""
+    """Return the bilinear color at u, v, from the first pixel's center; they lie in the photo up to rounding."""
     left, top = wp.clamp(int(u), 0, width - 2), wp.clamp(int(v), 0, height - 2)
     a, b = u - float(left), v - float(top)
     above = offset + wp.int64(top * width + left)

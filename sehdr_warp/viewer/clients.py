@@ -34,7 +34,7 @@ def is_local(host: str) -> bool:
 
 
 class SavedRun:
-    """A run for a save: every picture is made on the renderer, and the save ends if its client leaves."""
+    """A run while a client saves files: the renderer's thread renders pictures, until the client disconnects."""
 
     def __init__(
         self, on_renderer: Callable[[Connection, Callable[[], Any], int], Any], run: ViewerScene, client: Connection

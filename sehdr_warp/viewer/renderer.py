@@ -58,7 +58,7 @@ class Renderer:
             thread.join()
 
     def _next_picture(self, small: bool) -> "_Picture | None":
-        """Return the picture whose turn it is, of small ones alone if asked for, and None if none waits."""
+        """Return the picture whose turn it is, among small pictures only if `small`; None if none waits."""
         fitting = [each for each in self._waiting if not small or 0 < each.pixels <= _SMALL]
         return min(fitting, default=None)
 
