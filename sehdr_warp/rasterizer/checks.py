@@ -138,7 +138,9 @@ def check_position(position: Tensor) -> None:
 
 
 def check_directions(directions: Tensor) -> None:
-    """Raise ValueError for directions [..., 3] on the CPU that are not finite unit vectors."""
+    """Raise ValueError for directions [..., 3] that require a gradient, or on the CPU are not finite unit vectors."""
+    if directions.requires_grad and torch.is_grad_enabled():
+        raise ValueError("directions requires a gradient, which is not computed; pass directions.detach()")
     if directions.device.type == "cpu":
         low, high = (float(length) for length in directions.detach().norm(dim=-1).aminmax())
         if not (low > 0.99 and high < 1.01):

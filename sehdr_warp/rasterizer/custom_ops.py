@@ -154,7 +154,8 @@ def compiled_rasterize(
 
 
 def _run_directions(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
-    arguments, names = tensors, ("focal_length", "pixel_angle", "antialiased", "near_plane", "alpha_threshold")
+    names = "focal_length", "pixel_angle", "antialiased", "near_plane", "alpha_threshold"
+    arguments: Any = *tensors[:6], tensors[6].detach()
     return list(rasterize_directions(*arguments, **dict(zip(names, values, strict=True))))
 
 

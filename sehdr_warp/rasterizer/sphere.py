@@ -48,9 +48,9 @@ def rasterize_directions(
 ) -> tuple[Tensor, Tensor]:
     """Blend Gaussians along directions from a place: an environment map, or any picture of the sphere.
 
-    Differentiable with respect to every tensor but the directions. On the CPU gradients repeat bit for bit, whatever
-    the number of threads. Neighboring pixels should look in neighboring directions; blocks of 128 x 128 pixels are
-    culled as one. Order is by distance from the position.
+    Differentiable with respect to every tensor but the directions, which may not require a gradient. On the CPU
+    gradients repeat bit for bit, whatever the number of threads. Neighboring pixels should look in neighboring
+    directions; blocks of 128 x 128 pixels are culled as one. Order is by distance from the position.
 
     Args:
         means: [N, 3]; this and the next four as rasterize() takes them.
@@ -94,6 +94,10 @@ def rasterize_directions(
     if not height * width:
         raise ValueError(f"directions has shape {list(directions.shape)}, expected [H, W, 3] with at least one pixel")
     check_directions(directions)
+    if directions.requires_grad and torch.is_grad_enabled():
+        raise ValueError(
+            "directions requires a gradient, and there is none with respect to it; pass directions.detach()"
+        )
     footprint = EPS2D / focal_length**2
     smoothing = max(EPS2D * pixel_angle**2 - footprint, 0.0)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[1])):

@@ -266,28 +266,19 @@ def emit_intersections(
     return keys, gaussians
 
 
-class SortedIntersections(NamedTuple):
-    """Intersections by tile, as TileLists has them."""
-
-    tile_ranges: Tensor
-    gaussians: Tensor
-    subtile_masks: Tensor | None
-    emit_indices: Tensor | None
-
-
 def lists_by_tile(
     tiles: Tensor, gaussians: Tensor, length: int, packed: PackedSplats | None, grid: TileGrid, keep_emit_order: bool
-) -> SortedIntersections:
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
     """Sort intersections, emitted front to back, by tile, stably.
 
-    subtile_masks are None on the CPU and without packed Gaussians (of rasterize_directions()), emit_indices unless
-    keep_emit_order.
+    Returns TileLists.tile_ranges, gaussians, subtile_masks (None on the CPU and without packed Gaussians, as for
+    rasterize_directions()) and emit_indices (None unless keep_emit_order).
     """
     sort = _count_by_tile if tiles.device.type == "cpu" else _sort_by_tile
     return sort(tiles, gaussians, length, packed, grid, keep_emit_order)
 
 
-def _sort_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order) -> SortedIntersections:
+def _sort_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order):
     emit_indices = None
     if keep_emit_order:
         emit_indices = torch.empty(2 * length, dtype=torch.int32, device=tiles.device)
@@ -299,10 +290,10 @@ def _sort_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order) -> So
         emit_indices = emit_indices[:length].clone()
         gaussians = gaussians[:length][emit_indices] if length else gaussians
     tile_ranges, subtile_masks = find_tile_ranges(tiles[:length], gaussians, packed, grid)
-    return SortedIntersections(tile_ranges, gaussians, subtile_masks, emit_indices)
+    return tile_ranges, gaussians, subtile_masks, emit_indices
 
 
-def _count_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order) -> SortedIntersections:
+def _count_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order):
     """Sort by counting: each thread takes a few chunks, and within a tile those of the first chunk come first."""
     tiles, gaussians = tiles[:length], gaussians[:length]
     chunks = max(1, min(2 * thread_count(), length // MIN_CHUNK))
@@ -316,7 +307,7 @@ def _count_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order) -> S
     ordered = torch.empty_like(gaussians)
     emit_indices = torch.empty_like(gaussians) if keep_emit_order else None
     launch(kernels.place_intersections, chunks, tiles, gaussians, size, starts, ordered, emit_indices, ranges=spans)
-    return SortedIntersections(tile_ranges, ordered, None, emit_indices)
+    return tile_ranges, ordered, None, emit_indices
 
 
 def find_tile_ranges(

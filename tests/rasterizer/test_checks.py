@@ -90,6 +90,7 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
             "directions have lengths from 1.73205 to 1.73205, expected unit vectors",
         ),
         ("directions", torch.full((2, 2, 3), NAN).double(), ValueError, "directions have lengths from nan to nan"),
+        ("directions", torch.eye(3).double()[None].requires_grad_(), ValueError, r"pass directions\.detach\(\)"),
     ],
 )
 def test_misfits_of_a_picture_of_the_sphere_are_named(name, value, kind, message):

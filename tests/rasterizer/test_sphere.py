@@ -217,15 +217,6 @@ def test_what_cannot_be_drawn_is_left_out(device):
     assert image.shape == (32, 64, 4) and float(left.min()) == 1
 
 
-def test_directions_get_no_gradient_and_ask_for_none(device):
-    scene, position = gaussians(20, device=device), torch.zeros(3, dtype=torch.float64, device=device)
-    directions = latlong(32, device=device).requires_grad_()
-    assert not rasterize_directions(*scene, position, directions, focal_length=FOCAL)[0].requires_grad
-    scene[4].requires_grad_()
-    rasterize_directions(*scene, position, directions, focal_length=FOCAL)[0].sum().backward()
-    assert scene[4].grad.any() and directions.grad is None
-
-
 def test_caps_hold_their_directions():
     directions = latlong(50)
     for side in (16, 128):
