@@ -159,7 +159,7 @@ def _verdict(records: Sequence[ImageRecord], layout: str, pairs: Sequence[tuple[
     miss = float(np.median(stated)) if stated else 0.0
     if len(stated) < _FEWEST_PAIRS or miss < _EXACT:
         return _Verdict()
-    file = records[0].lens.source.name
+    file = records[0].lens.source.name.replace("cameras.", "images.")  # Of COLMAP, which states poses there
     far = f"pixels that two photos share lie {miss:.1f} pixels beside where {file} puts them"
     if miss == np.inf:
         far = f"{file} puts points that two photos share behind the cameras"

@@ -1,15 +1,21 @@
 """Exposure times: units, sets that differ in ISO alone, and times that EXIF contradicts."""
 
 import json
+import re
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sehdr_warp.errors import InputError
+from sehdr_warp.scene.exposure.times import shutter
 from sehdr_warp.scene.images.exif import parse_number
+from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
-from tests.make_scenes import write_blender, write_colmap
+from tests.make_scenes import edited_json, load, write_blender, write_colmap
 
-TIME, NUMBER, ISO = 33434, 33437, 34855
+TIME, NUMBER, ISO, APEX = 33434, 33437, 34855, 37377
 
 
 def seconds(dataset):
@@ -98,3 +104,112 @@ def test_times_that_exif_contradicts_are_named_and_count(tmp_path):
 def test_units_of_transforms(tmp_path, fields):
     write_blender(tmp_path, 3, **fields)
     np.testing.assert_allclose(seconds(parse_dataset(tmp_path)), [0.008] * 3)
+
+
+def test_exif_times_count_sensitivity_and_aperture(tmp_path):
+    settings = [(0.01, 100, 4), (0.02, 100, 4), (0.01, 200, 4), (0.01, 100, 8), (0.005, 400, 4), (1, 100, 4)]
+    exif = {i: {TIME: t, ISO: iso, NUMBER: n} for i, (t, iso, n) in enumerate(settings)}
+    write_colmap(tmp_path, name="{:03d}.jpg", exif=exif)
+    scene = load(tmp_path)
+    light = [t * iso / 100 * (4 / n) ** 2 for t, iso, n in settings]
+    np.testing.assert_allclose([view.exposure_time for view in scene.views], light, rtol=1e-5)
+    assert scene.exposure_times_known
+    text = " ".join(scene.notes)
+    assert "ISO differs (100 to 400)" in text and "exposures differ: 1/400 to 1 s" in text
+
+
+def test_exposures_of_photos_that_are_left_out_are_not_told_of(tmp_path, monkeypatch):
+    exif = {i: {TIME: 0.01, ISO: 100} for i in range(5)} | {5: {TIME: 1.0, ISO: 400}}
+    write_colmap(tmp_path / "model", name="{:03d}.jpg", exif=exif)
+    placed = load(tmp_path / "model")
+    assert "exposures differ: 1/100 to 4 s" in " ".join(placed.notes)
+    photos = shutil.copytree(tmp_path / "model" / "images", tmp_path / "bare")
+
+    def place_all_but_the_last(dataset, _):
+        camera = placed.views[0].camera
+        lens = Lens("PINHOLE", camera.width, camera.height, tuple(camera.intrinsics), photos)
+        records = (replace(r, lens=lens, world_to_camera=np.eye(4)) for r in dataset.records if r.view != "005")
+        return replace(dataset, records=tuple(records)), ["005.jpg"]
+
+    monkeypatch.setattr("sehdr_warp.scene.load.place_photos", place_all_but_the_last)
+    notes = " ".join(load(photos).notes)
+    assert "exposures differ" not in notes and "ISO" not in notes
+    damaged = tmp_path / "model" / "images" / "005.jpg"
+    damaged.write_bytes(damaged.read_bytes()[:-600])
+    notes = " ".join(load(tmp_path / "model").notes)
+    assert "1 of 6 photos cannot be used" in notes and "exposures differ" not in notes
+
+
+@pytest.mark.parametrize(
+    "seconds, text",
+    [(1 / 640, "1/640 s"), (0.000634115, "1/1577 s"), (0.125, "1/8 s"), (0.28, "0.28 s"), (0.4, "0.4 s"), (8, "8 s")],
+)
+def test_times_read_as_photographers_write_them(seconds, text):
+    assert shutter(seconds) == text
+
+
+def test_one_photo_without_time_does_not_stop_a_set_and_a_list_helps(tmp_path):
+    write_colmap(tmp_path, name="{:03d}.jpg", exif={i: {TIME: 0.01} for i in range(5)})
+    assert any(note.startswith("005 does not state its exposure: ") for note in load(tmp_path).notes)
+    (tmp_path / "exposures.json").write_text(json.dumps({"005.jpg": 0.02}))
+    assert [view.exposure_time for view in load(tmp_path).views] == [0.01] * 5 + [0.02]
+    (tmp_path / "exposures.json").write_text(json.dumps({f"{i:03d}.jpg": 2.0 for i in range(6)}))
+    assert {view.exposure_time for view in load(tmp_path).views} == {2.0}
+    (tmp_path / "exposures.json").write_text(json.dumps({f"{i:03d}.jpg": "1/125" for i in range(6)}))
+    assert {view.exposure_time for view in load(tmp_path).views} == {0.008}
+    for wrong in (0, "1/0", "1/60 x", "/2", True, None, [1]):
+        (tmp_path / "exposures.json").write_text(json.dumps([{"file": "000.jpg", "exposure_time": wrong}]))
+        with pytest.raises(InputError, match=rf"time of .000.jpg. is {re.escape(repr(wrong))}"):
+            load(tmp_path)
+
+
+def test_listed_times_of_no_photo_are_named(tmp_path):
+    write_colmap(tmp_path, name="{:03d}.jpg")
+    times, table = {f"{i:03d}.jpg": 0.01 for i in range(6)}, tmp_path / "exposures.json"
+    table.write_text(json.dumps(times))
+    assert not [note for note in load(tmp_path).notes if "exposures.json" in note]
+    table.write_text(json.dumps(times | {"000.JPG.bak": 0.01}))
+    assert "exposures.json: 1 of its 7 names belong to no photo: 000.JPG.bak" in load(tmp_path).notes
+    table.write_text(json.dumps({name.replace("5.jpg", "5x.jpg"): time for name, time in times.items()}))
+    notes = load(tmp_path).notes
+    assert "exposures.json: 1 of its 6 names belong to no photo: 005x.jpg" in notes
+    assert any(note.startswith("005 does not state its exposure: ") for note in notes)
+    table.write_text(json.dumps({f"shot{i}.jpg": 0.01 for i in range(6)}))
+    assert [note for note in load(tmp_path).notes if "6 of its 6 names" in note and "shot2.jpg ..." in note]
+
+
+@pytest.mark.parametrize("name", ["exposures.csv", "Exposures.json", "exposure_times.txt"])
+def test_lists_of_times_that_are_not_read_are_named(tmp_path, name):
+    write_blender(tmp_path)
+    (tmp_path / name).write_text("{}")
+    note = f'{name} is not read: write exposures.json, {{"file name": seconds, ...}}'
+    assert note in load(tmp_path).notes
+
+
+def test_one_frame_with_an_impossible_time_stops_no_set(tmp_path):
+    write_blender(tmp_path)
+    with edited_json(tmp_path / "transforms.json") as values:
+        for i, frame in enumerate(values["frames"]):
+            frame["exposure_time"] = 0.5 if i else -1
+    scene = load(tmp_path, holdout=0)
+    assert len(scene.views) == 6 and scene.views[1].exposure_time == 0.5
+    assert "1 of 6 frames state no usable exposure time: exposure time of './images/r_0' is -1" in scene.notes
+    for frame in values["frames"]:
+        frame["exposure_time"] = -1
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match="exposure time of './images/r_0' is -1; state seconds above zero"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["{}.JPG", "{}.CR2", "images/{}", "C:\\scan\\images\\{}.jpg", "/home/me/scan/images/{}.jpg", "./IMAGES/{}.jpg"],
+)
+def test_listed_times_under_other_spellings(tmp_path, name):
+    """Another case, the suffix of another kind of photo, or a path of the machine that wrote the list."""
+    write_colmap(tmp_path, name="img_{}.jpg")
+    times = {name.format(f"img_{i}"): 0.01 * 2**i for i in range(6)}
+    (tmp_path / "exposures.json").write_text(json.dumps(times))
+    scene = load(tmp_path, holdout=0)
+    assert [view.exposure_time for view in scene.views] == pytest.approx(list(times.values()))
+    assert not [note for note in scene.notes if "exposures.json" in note]

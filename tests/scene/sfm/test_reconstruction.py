@@ -1,15 +1,28 @@
-"""The cache of structure from motion: its key holds whatever changes a result."""
+"""Structure from motion: what its cache depends on, and how it places bare photos of all kinds."""
+
+import shutil
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.scene.sfm import pairs, reconstruction
+from sehdr_warp.scene.color.primaries import linear_to_srgb, srgb_to_linear
+from sehdr_warp.scene.dataparser import PointCloud
+from sehdr_warp.scene.lens import Lens
+from sehdr_warp.scene.photos import brightened_codes
+from sehdr_warp.scene.readers import bare_photos
+from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
+from sehdr_warp.scene.sfm import pairs
+from sehdr_warp.scene.sfm import reconstruction as sfm
+from sehdr_warp.scene.sfm.reconstruction import MOST_ERROR, Reconstruction, image_name, reconstruct
+from tests.make_scenes import arc_poses, load
 
 WITHOUT_EFFECT = {"MOST_ERROR", "_PAIR_COST", "_PLACE_COST"}  # Of a message and of estimates of time
 CONSTANTS = {
     name
-    for module in (pairs, reconstruction)
+    for module in (pairs, sfm)
     for name, value in vars(module).items()
     if name.isupper() and isinstance(value, int | float) and name not in WITHOUT_EFFECT
 }
@@ -27,10 +40,10 @@ def key(monkeypatch, tmp_path):
 
     def compute(masks=()):
         with pytest.raises(InterruptedError) as stopped:
-            reconstruction.reconstruct(photos, None, masks)
+            sfm.reconstruct(photos, None, masks)
         return str(stopped.value)
 
-    monkeypatch.setattr(reconstruction, "solved_folder", stop)
+    monkeypatch.setattr(sfm, "solved_folder", stop)
     return compute
 
 
@@ -42,7 +55,7 @@ def test_a_killed_process_leaves_no_copies_of_photos_in_the_cache(tmp_path):
         places.append((work, result))
         (result / "facts.json").write_text("{}")
 
-    folder = reconstruction.solved_folder(tmp_path / "cache", "k", solve)
+    folder = sfm.solved_folder(tmp_path / "cache", "k", solve)
     assert places[0][0].parent == places[0][1] and [file.name for file in folder.iterdir() if file.is_dir()] == []
 
 
@@ -50,14 +63,14 @@ def test_a_killed_process_leaves_no_copies_of_photos_in_the_cache(tmp_path):
 def test_a_constant_that_changes_the_result_finds_cameras_anew(name, key, monkeypatch):
     before = key()
     assert key() == before
-    monkeypatch.setattr(reconstruction, name, getattr(reconstruction, name) + 1)
+    monkeypatch.setattr(sfm, name, getattr(sfm, name) + 1)
     assert key() != before
 
 
-@pytest.mark.parametrize("field", reconstruction.BRIGHTENING._fields)
+@pytest.mark.parametrize("field", sfm.BRIGHTENING._fields)
 def test_another_brightening_finds_cameras_anew(field, key, monkeypatch):
-    before, brightening = key(), reconstruction.BRIGHTENING
-    monkeypatch.setattr(reconstruction, "BRIGHTENING", brightening._replace(**{field: 0.1}))
+    before, brightening = key(), sfm.BRIGHTENING
+    monkeypatch.setattr(sfm, "BRIGHTENING", brightening._replace(**{field: 0.1}))
     assert key() != before
 
 
@@ -67,10 +80,10 @@ def test_photos_masks_and_another_pycolmap_find_cameras_anew(key, monkeypatch, t
     masked = key([mask, None])
     mask.write_bytes(b"2")
     assert key([None, None]) == before and len({before, masked, key([mask, None]), key([None, mask])}) == 4
-    monkeypatch.setattr(reconstruction, "version", lambda name: f"{name} 0")
+    monkeypatch.setattr(sfm, "version", lambda name: f"{name} 0")
     assert key() != before
     monkeypatch.undo()
-    assert reconstruction.cache_key("photos") != reconstruction.cache_key("panoramas")
+    assert sfm.cache_key("photos") != sfm.cache_key("panoramas")
 
 
 def test_images_are_numbered_by_name_however_long_their_features_take(tmp_path):
@@ -82,9 +95,186 @@ def test_images_are_numbered_by_name_however_long_their_features_take(tmp_path):
         blocks = random.integers(0, 255, (60, 80), np.uint8)
         pixels = np.kron(blocks, np.ones((6, 6), np.uint8)) if index == 0 else np.full((360, 480), 99, np.uint8)
         Image.fromarray(pixels).save(tmp_path / "images" / name)
-    reconstruction._extract(tmp_path / "database.db", tmp_path, names, "SIMPLE_RADIAL", (600.0, 240.0, 180.0, 0.0))
+    sfm._extract(tmp_path / "database.db", tmp_path, names, "SIMPLE_RADIAL", (600.0, 240.0, 180.0, 0.0))
     with pycolmap.Database.open(tmp_path / "database.db") as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
         assert [image.name for image in images] == names
         assert len({image.camera_id for image in images}) == 1 == opened.num_cameras()
         assert opened.num_keypoints_for_image(images[0].image_id) > 100
+
+
+LOST = image_name(2)
+
+
+def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, shared, caplog):
+    """Five of the castle's photos at a fifth of their size: all placed, EXIF times kept, the second call reuses."""
+    photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
+    for photo in photos:
+        with Image.open(photo) as image:
+            image.reduce(4).save(tmp_path / photo.name, exif=image.getexif(), quality=95)
+    caplog.set_level("INFO", "sehdr_warp.scene")
+    scene = load(tmp_path, max_size=200, cache=tmp_path / "cache")
+    assert scene.format == "photos" and len(scene.views) == 5 and len(scene.points) > 200
+    assert len({view.exposure_time for view in scene.views}) > 1 and scene.exposure_times_known
+    assert max(view.image.shape[1] for view in scene.views) == 200 and scene.views[0].camera.width == 200
+    # Every point lies before the cameras, and most of it inside the pictures that show it.
+    for view in scene.views:
+        x, y, z = view.camera.world_to_camera[:3, :3] @ scene.points.T + view.camera.world_to_camera[:3, 3:]
+        column = view.camera.fx * x / z + view.camera.cx
+        row = view.camera.fy * y / z + view.camera.cy
+        inside = (z > 0) & (column > 0) & (column < view.camera.width) & (row > 0) & (row < view.camera.height)
+        assert inside.mean() > 0.4
+        colors = view.image[row[inside].astype(int), column[inside].astype(int)]
+        assert np.corrcoef(colors.ravel(), scene.point_colors[inside].ravel())[0, 1] > 0.5
+    caplog.clear()
+    (tmp_path / "moved").mkdir()
+    for photo in tmp_path.glob("*.JPG"):
+        shutil.copy(photo, tmp_path / "moved")
+    again = load(tmp_path / "moved", max_size=100, cache=tmp_path / "cache")
+    assert "cached" in caplog.messages[0]
+    np.testing.assert_array_equal(again.points, scene.points)
+    assert not [entry for entry in (tmp_path / "cache").iterdir() if entry.name.startswith("sehdr-sfm-")]
+
+
+def test_turned_photos_are_placed_upright(tmp_path, shared):
+    """Photos stored on their side with an EXIF orientation give the scene of the upright ones."""
+    for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]:
+        with Image.open(photo) as image:
+            upright = image.reduce(6)
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        for folder, picture, tags in (("up", upright, Image.Exif()), ("side", upright.rotate(90, expand=True), exif)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            picture.save(tmp_path / folder / f"{photo.stem}.png", exif=tags)
+    up, side = (load(tmp_path / folder, max_size=100) for folder in ("up", "side"))
+    assert len(up.views) == len(side.views) == 4
+    for a, b in zip(up.views, side.views, strict=True):
+        assert a.image.shape == b.image.shape
+        assert np.abs(a.image - b.image).mean() < 0.01
+
+
+def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
+    photos = sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]
+    for i, photo in enumerate(photos):
+        with Image.open(photo) as image:
+            image.reduce(4 if i < 3 else 5).save(tmp_path / photo.name, quality=95)
+    reconstruction = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
+    assert {(image.lens.width, image.lens.height) for image in reconstruction.model.images} == {(567, 426), (708, 532)}
+    assert 0 < reconstruction.error < MOST_ERROR and not reconstruction.notes(photos)
+
+
+def test_dark_photos_are_placed_by_brightened_codes(tmp_path, shared):
+    for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]:
+        with Image.open(photo) as image:
+            light = srgb_to_linear(np.asarray(image.reduce(6)) / 255) / 32
+        Image.fromarray(np.rint(255 * linear_to_srgb(light)).astype(np.uint8)).save(tmp_path / f"{photo.stem}.png")
+    reconstruction = reconstruct(sorted(tmp_path.glob("*.png")), tmp_path / "cache")
+    assert len(reconstruction.model.images) == 4 and not reconstruction.weak
+    assert len(reconstruction.model.cloud.positions) > 300  # 83 without
+
+
+def test_codes_of_bright_photos_stay_and_those_of_dark_ones_reach_a_midtone():
+    bright = np.full((16, 16, 3), 100, np.uint8)
+    assert brightened_codes(bright) is bright
+    np.testing.assert_array_equal(brightened_codes(bright.astype(np.uint16) * 257), bright)
+    assert abs(int(brightened_codes(np.full((16, 16, 3), 5000, np.uint16)).mean()) - 0.3 * 255) < 1
+    assert not brightened_codes(np.zeros((16, 16, 3), np.uint8)).any()
+    bright[:, 4:] = 1  # A black background with noise
+    assert brightened_codes(bright) is bright
+
+
+def test_an_object_that_turns_is_placed_by_its_masks(tmp_path, shared):
+    known = {view.name: view.camera for view in load(shared / "data" / "tankard_turntable", max_size=100).views}
+    for kind, suffix in (("images", "jpg"), ("masks", "png")):
+        (tmp_path / kind).mkdir()
+        for index in range(9669, 9677):
+            shutil.copy(shared / "data" / "tankard_turntable" / kind / f"IMG_{index}.{suffix}", tmp_path / kind)
+    views = load(tmp_path, max_size=100).views
+    turns = [(view.camera.world_to_camera[:3, :3], known[view.name].world_to_camera[:3, :3]) for view in views]
+    assert len(views) >= 6
+    for (a, true_a), (b, true_b) in pairwise(turns):
+        difference = (b @ a.T) @ (true_b @ true_a.T).T
+        assert np.degrees(np.arccos(np.clip((np.trace(difference) - 1) / 2, -1, 1))) < 1
+
+
+def test_masks_that_keep_too_little_are_not_used_for_placing(tmp_path, shared, caplog):
+    (tmp_path / "masks").mkdir()
+    for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]:
+        with Image.open(photo) as image:
+            image.reduce(6).save(tmp_path / photo.name, quality=95)
+            mask = Image.new("L", image.reduce(6).size)
+        mask.paste(255, (0, 0, 60, 60))
+        mask.save(tmp_path / "masks" / f"{photo.stem}.png")
+    assert len(load(tmp_path, max_size=100).views) == 4
+    assert "masks leave too little to place half of the photos" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "photos, weak, turn, expected", [(6, (), 0, 6), (4, (1,), 0, 6), (4, (), 0, 4), (6, (), 0.2, 4)]
+)
+def test_whole_photos_are_used_if_they_place_more_and_agree_with_masks(
+    photos, weak, turn, expected, monkeypatch, caplog
+):
+    """Masks place four photos, whole photos six, whose cameras turn otherwise if an object turns before them."""
+    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
+
+    def reconstruction(poses, weak=()):
+        images = tuple(ModelImage(image_name(i), lens, pose) for i, pose in enumerate(poses))
+        cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+        return Reconstruction(SparseModel(images, cloud), 0.5, weak)
+
+    def turned(angle):
+        sine, cosine = np.sin(angle), np.cos(angle)
+        return np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+
+    inside = reconstruction(arc_poses(6)[:4], weak)
+    whole = reconstruction([turned(i * turn) @ pose @ turned(0.7) for i, pose in enumerate(arc_poses(6))])
+    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): inside if masks else whole)
+    files = [Path(f"{i}.jpg") for i in range(photos)]
+    assert len(bare_photos._reconstruct(files, None, files).model.images) == expected
+    assert ("and cameras agree" in caplog.text) == (expected == 6)
+
+
+def test_masks_count_if_whole_photos_place_no_more_than_they(monkeypatch, caplog):
+    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
+    images = tuple(ModelImage(image_name(i), lens, np.eye(4)) for i in range(4))
+    cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    found = {masked: Reconstruction(SparseModel(images, cloud), 0.5, ()) for masked in (True, False)}
+    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): found[bool(masks)])
+    files = [Path(f"{i}.jpg") for i in range(12)]
+    assert bare_photos._reconstruct(files, None, files) is found[True] and not caplog.text
+
+
+def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypatch, caplog):
+    """And a photo that none is likely for is matched with all others before the second try."""
+    monkeypatch.setattr(sfm, "EXHAUSTIVE_LIMIT", 3)
+    photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
+    for photo in photos:
+        with Image.open(photo) as image:
+            image.reduce(4).save(tmp_path / photo.name, quality=95)
+    photos = sorted(tmp_path.glob("*.JPG"))
+    caplog.set_level("INFO", "sehdr_warp.scene")
+    assert len(reconstruct(photos, tmp_path / "cache").model.images) == 5
+    assert "comparing photos: 5" in caplog.messages
+    likely = sfm.likely_pairs
+    monkeypatch.setattr(sfm, "likely_pairs", lambda database: [pair for pair in likely(database) if LOST not in pair])
+    again = reconstruct(photos, tmp_path / "again")
+    assert "matching pairs of photos that could not be placed: 4" in caplog.messages
+    assert LOST in {image.name for image in again.model.images} and len(again.model.images) == 5
+
+
+def test_poor_placement_is_named_with_its_photos():
+    photos = [Path(f"{index}.jpg") for index in range(8)]
+    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
+    images = tuple(ModelImage(f"{index:05d}.png", lens, np.eye(4)) for index in (0, 1, 2, 3, 4, 6))
+    model = SparseModel(images, PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32)))
+    lost, weak, error = Reconstruction(model, 1.4, (2, 4)).notes(photos)
+    assert lost == (
+        "2 of 8 photos could not be placed and were left out: 5.jpg, 7.jpg; photos between these and the others help"
+    )
+    assert weak.startswith("2 photos share few points with others, so their places are uncertain: 2.jpg, 4.jpg;")
+    assert "1.4 pixels" in error
+    lost, _ = Reconstruction(SparseModel(images[:1], model.cloud), 0.5, (0,)).notes(photos)
+    assert "7 of 8 photos could not be placed and were left out: 1.jpg to 7.jpg;" in lost
+    _, weak, _ = Reconstruction(model, 1.4, (3,)).notes(photos)
+    assert weak.startswith("1 photo shares few points with others, so its place is uncertain: 3.jpg;")
