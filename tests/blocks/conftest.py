@@ -1,6 +1,11 @@
 """A town as survey photos, and as two trained blocks, for all tests of blocks."""
 
+import os
+import threading
+import time
+from contextlib import suppress
 from functools import cache
+from glob import glob
 from types import SimpleNamespace
 
 import pytest
@@ -54,6 +59,36 @@ def two_blocks(survey, divide, tmp_path_factory):
         return out, plan
 
     return train
+
+
+@pytest.fixture(scope="session")
+def interrupt():
+    """Return a function that sends a signal, in a thread, to the process that trains a block."""
+
+    def locker(folder):
+        """Return the process that holds the lock of the folder, or None."""
+        for handle in glob("/proc/[0-9]*/fd/*") if (folder / ".lock").exists() else ():
+            with suppress(OSError):
+                if os.readlink(handle) == str(folder / ".lock"):
+                    return int(handle.split("/")[2])
+        return None
+
+    def send(folder, number):
+        """Find the process before its training has written a checkpoint, since the end may come soon after that."""
+        process, deadline = None, time.monotonic() + 300
+        while time.monotonic() < deadline:
+            process = process or locker(folder)
+            if process and glob(f"{folder}/checkpoints/iteration_*[1-9]*"):
+                os.kill(process, number)
+                return
+            time.sleep(0.02)
+
+    def begin(folder, number):
+        thread = threading.Thread(target=send, args=(folder, number))
+        thread.start()
+        return thread
+
+    return begin
 
 
 @pytest.fixture

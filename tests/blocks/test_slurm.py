@@ -3,10 +3,6 @@
 import os
 import signal
 import sys
-import threading
-import time
-from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -89,30 +85,15 @@ def cluster(tmp_path, monkeypatch):
     return jobs
 
 
-def send(out, *numbers):
-    """Send each signal to the process of another block when both have written a checkpoint of their training."""
-    numbers = list(numbers)
-    deadline = time.monotonic() + 90
-    while time.monotonic() < deadline:
-        begun = {path.parents[1] for path in out.glob("blocks/block_*/checkpoints/iteration_*[1-9]*")}
-        for place in Path("/proc").glob("[0-9]*") if len(begun) == 2 else ():
-            with suppress(OSError):
-                words = (place / "cmdline").read_text()
-                if "submitit.core._submit" in words and str(out) in words:
-                    os.kill(int(place.name), numbers.pop())
-                    if not numbers:
-                        return
-        time.sleep(0.02)
-
-
-def test_jobs_that_are_ended_go_on_and_the_blocks_are_merged(cluster, survey, tmp_path):
+def test_jobs_that_are_ended_go_on_and_the_blocks_are_merged(cluster, survey, interrupt, tmp_path):
     """SIGUSR2 announces the time limit, SIGTERM that another job takes the node."""
     out = tmp_path / "run"
-    sender = threading.Thread(target=send, args=(out, signal.SIGUSR2, signal.SIGTERM))
-    sender.start()
+    ended = {"block_01": signal.SIGUSR2, "block_02": signal.SIGTERM}
+    threads = [interrupt(out / "blocks" / name, number) for name, number in ended.items()]
     words = ["--schedule.checkpoint-every", "3000", "--slurm", "partition=gpu,time=9,mem=4GB"]
     assert call("train", survey, "--out", out, *[*FLAGS, *words]) == 0
-    sender.join()
+    for thread in threads:
+        thread.join()
     scripts = [script.read_text() for script in sorted(cluster.glob("*.sh"))]
     assert len(scripts) == 3 and len(list(cluster.glob("*.requeued"))) == 1, "SLURM requeues one, the other is new"
     for flag in ("--partition=gpu", "--time=9", "--mem=4GB", "--job-name=sehdr-warp"):
@@ -141,16 +122,15 @@ def test_what_slurm_refuses_is_one_line(cluster, survey, tmp_path, capfd, monkey
     assert 'Could not detect "srun"' in line("partition=gpu")
 
 
-def test_a_killed_job_is_noticed_without_accounts(cluster, survey, tmp_path, monkeypatch, capfd):
+def test_a_killed_job_is_noticed_without_accounts(cluster, survey, interrupt, tmp_path, monkeypatch, capfd):
     sacct = tmp_path / "bin" / "sacct"
     sacct.write_text("#!/bin/bash\necho 'Slurm accounting storage is disabled' >&2\nexit 1\n")
     monkeypatch.setattr(slurm_states, "LOOK_EVERY", 1.0)
     out = tmp_path / "run"
-    sender = threading.Thread(target=send, args=(out, signal.SIGKILL))
-    sender.start()
+    thread = interrupt(out / "blocks" / "block_01", signal.SIGKILL)
     words = ["--schedule.checkpoint-every", "3000", "--slurm", "partition=gpu,time=9"]
     assert call("train", survey, "--out", out, *[*FLAGS, *words]) == 0
-    sender.join()
+    thread.join()
     printed = capfd.readouterr().err
     assert len(list(cluster.glob("*.sh"))) == 3
     assert "ended without a result (job 10" in printed and "state FAILED" in printed

@@ -5,11 +5,7 @@ import os
 import re
 import signal
 import sys
-import threading
-import time
-from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,33 +28,17 @@ from ..refusals import call, refused
 submitit = pytest.importorskip("submitit")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 
-FLAGS = ["--device", "cpu", "--response", "srgb", "--iterations", "100", "--preset", "fast"]
+FLAGS = ["--device", "cpu", "--response", "srgb", "--iterations", "150", "--preset", "fast"]
 
 
 @pytest.fixture(scope="module")
-def merged(survey, tmp_path_factory):
-    """Trained in two blocks; the process of the first one to begin is killed once."""
+def merged(survey, interrupt, tmp_path_factory):
+    """Trained in two blocks; the process of the first is killed once."""
     out = tmp_path_factory.mktemp("merged") / "run"
-    killer = threading.Thread(target=kill_first, args=(out,))
-    killer.start()
+    killer = interrupt(out / "blocks" / "block_01", signal.SIGKILL)
     assert call("train", survey, "--out", out, "--blocks", "2", *FLAGS, "--schedule.checkpoint-every", "3000") == 0
     killer.join()
     return out
-
-
-def kill_first(out):
-    """Kills the job of the first block as soon as its training has begun."""
-    deadline = time.monotonic() + 90
-    while time.monotonic() < deadline:
-        for checkpoint in out.glob("blocks/block_01/checkpoints/iteration_*[1-9]*"):
-            for place in Path("/proc").glob("[0-9]*"):
-                with suppress(OSError):
-                    words = (place / "cmdline").read_text()
-                    if "submitit.core._submit" in words and str(out) in words:
-                        os.kill(int(place.name), signal.SIGKILL)
-            assert checkpoint
-            return
-        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module", autouse=True)

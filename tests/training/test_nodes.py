@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="ranks share pho
 
 TRAIN = ["train", "embedded", "--device", "cpu", "--max-size", "24", "--preset", "fast", "--response", "srgb"]
 TRAIN += ["--schedule.checkpoint-every", "3000", "--mcmc.seed-fraction", "0", "--model.initial-density", "0"]
-SHORT = [*TRAIN, "--iterations", "200"]
+SHORT = [*TRAIN, "--iterations", "100"]
 
 
 def free_port() -> int:
@@ -80,7 +80,7 @@ def end(process: subprocess.Popen) -> None:
 def result(run) -> str:
     """The hash of all tensors of a run's newest checkpoint."""
     checkpoint = RunFolder(run).newest_checkpoint()
-    assert checkpoint is not None and checkpoint.values["iteration"] == 200
+    assert checkpoint is not None and checkpoint.values["iteration"] == 100
     return checkpoint.values["sha256"]
 
 
@@ -118,8 +118,8 @@ def test_two_nodes_train_the_same_bits_as_one_although_one_is_lost(one_node, two
 
 def test_one_node_goes_on(two_nodes):
     out, _ = two_nodes
-    assert call("train", "--resume", "--out", out, "--device", "cpu", "--iterations", "210") == 0
-    assert load_run(out).iterations == 210
+    assert call("train", "--resume", "--out", out, "--device", "cpu", "--iterations", "110") == 0
+    assert load_run(out).iterations == 110
 
 
 def test_a_node_that_does_not_come_is_named(tmp_path):
