@@ -7,12 +7,14 @@ without an error.
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from ..errors import InputError
 from .cached_folder import cached_folder, file_digest
 from .dataparser import ImageRecord
 from .lens import Lens
@@ -20,7 +22,7 @@ from .shared_pixels import SharedPixels, candidate_pairs, shared_pixels
 
 POSED = ("transforms", "colmap", "llff", "opensfm")
 """Layouts whose cameras are checked."""
-_VERSION = 1  # Raised with every change of results
+_VERSION = 2  # Raised with every change of results
 _AXES = {  # From a camera's axes to OpenCV's: x right, y down, z ahead
     "OpenCV's": np.eye(3),
     "OpenGL's": np.diag([1.0, -1.0, -1.0]),
@@ -35,6 +37,8 @@ _LEAST_SHARE = 0.75  # Of the pairs, which another reading must fit
 _LEAST_GAIN = 2.0  # By which another lens must fit better
 _FOCAL_LENGTHS = np.geomspace(0.3, 3.3, 61)  # In parts of the stated one
 _LEAST_CHANGE = 0.05  # Of the focal length
+_CLEARLY = 1.25  # By which one reading of the lens must fit better than a simpler one
+_ALIKE = 1.2  # Ratio of focal lengths, in parts of the photos' sides, of cameras that one mistake may concern
 _OFF_CENTER = 0.1  # Part of a photo's size by which a principal point of another size lies beside the middle
 
 
@@ -66,10 +70,14 @@ def with_fitting_cameras(
     if any(record.derived or not record.image.is_file() for record in used):
         return list(records), []
     facts = [
-        (file_digest(record.image), record.lens.model, record.lens.params, record.world_to_camera.tolist(), layout)
+        (
+            [file_digest(file) for file in (record.image, record.mask) if file is not None],
+            (record.lens.model, record.lens.width, record.lens.height, record.lens.params, record.lens.source.name),
+            record.world_to_camera.tolist(),
+        )
         for record in used
     ]
-    key = hashlib.sha256(json.dumps([_VERSION, pairs, facts]).encode()).hexdigest()[:16]
+    key = hashlib.sha256(json.dumps([_VERSION, layout, pairs, facts]).encode()).hexdigest()[:16]
 
     def fill(result: Path) -> None:
         (result / "verdict.json").write_text(json.dumps(asdict(_verdict(records, layout, pairs))))
@@ -186,17 +194,46 @@ def _fit(distances: Sequence[float]) -> bool:
 
 
 def _best_lens(records: Sequence[ImageRecord], shared: Sequence[SharedPixels]) -> tuple[_Verdict, list[float]]:
-    """Return the reading of the lens that fits best, and its distances."""
+    """Return the reading of the lens that fits best, and its distances.
+
+    A simpler reading wins unless another one fits clearly better. Unlike lenses are read as stated: some may be right.
+    """
     lens, best = records[0].lens, (_Verdict(), _distances(records, shared))
+    views = [max(record.lens.focal) / max(record.lens.width, record.lens.height) for record in records]
+    if max(views) > _ALIKE * min(views):
+        return best
     off_center = max(abs(lens.centre[0] / lens.width - 0.5), abs(lens.centre[1] / lens.height - 0.5)) > _OFF_CENTER
+
+    def found(focal: float, kind: _Verdict) -> list[float]:
+        try:
+            return _distances(records, shared, verdict=replace(kind, focal=float(focal)))
+        except InputError:  # No lens is so short or so long.
+            return [math.inf] * len(shared)
+
     for whole in (False, True)[: 1 + off_center]:
         for distorted in (True, False)[: 2 - lens.is_pinhole]:
-            for focal in (1.0, *_FOCAL_LENGTHS):
-                if not 0 < abs(focal - 1) < _LEAST_CHANGE:
-                    verdict = _Verdict(focal=float(focal), whole=whole, distorted=distorted)
-                    found = _distances(records, shared, verdict=verdict)
-                    best = min(best, (verdict, found), key=lambda each: float(np.median(each[1])))
+            kind = _Verdict(whole=whole, distorted=distorted)
+            for focal in (1.0, _best_focal(lambda focal, kind=kind: _typical(found(focal, kind)))):
+                distances = found(focal, kind)
+                unchanged = 0 < abs(focal - 1) < _LEAST_CHANGE
+                if not unchanged and _CLEARLY * _typical(distances) < _typical(best[1]):
+                    best = replace(kind, focal=focal), distances
     return best
+
+
+def _best_focal(distance: Callable[[float], float]) -> float:
+    """Return the focal length, in parts of the stated one, at which a distance is least."""
+    from scipy.optimize import minimize_scalar
+
+    nearest = int(np.argmin([distance(float(focal)) for focal in _FOCAL_LENGTHS]))
+    low, high = _FOCAL_LENGTHS[[max(nearest - 1, 0), min(nearest + 1, len(_FOCAL_LENGTHS) - 1)]]
+    found = minimize_scalar(distance, bounds=(low, high), method="bounded", options={"xatol": 1e-3 * low})
+    return float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _typical(distances: Sequence[float]) -> float:
+    """Return the mean of the distances that another reading must explain."""
+    return float(np.mean(sorted(distances)[: math.ceil(_LEAST_SHARE * len(distances))]))
 
 
 def _distances(

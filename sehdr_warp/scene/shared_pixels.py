@@ -11,6 +11,7 @@ from ..errors import InputError
 from .dataparser import ImageRecord
 from .images.ldr_files import PILLOW_ERRORS, open_image, orientation_of, turn_upright
 from .lens import Lens
+from .masks import read_mask
 from .photos import fitted_lens
 from .sfm.reconstruction import quiet_colmap
 
@@ -19,6 +20,7 @@ _MOST_FEATURES = 2000
 _FEWEST_MATCHES, _RATIO = 30, 0.75  # Of a pair; a match's distance as part of that of the second best
 _MOST_PAIRS = 12
 _LEAST_BASELINE = 0.02  # Of the usual distance of cameras from their middle: nearer ones show no depth
+_MASKED = 0.5  # Value of a mask up to which pixels do not count
 _IN_FRONT = 0.2  # Part of the points that two cameras of the right direction see in front of them, at least
 
 
@@ -47,7 +49,8 @@ class SharedPixels(NamedTuple):
 def candidate_pairs(records: Sequence[ImageRecord]) -> list[tuple[int, int]]:
     """List pairs of photos that may share pixels: by turns neighbors in the set, and cameras that are near each other.
 
-    Poses that are wrong may not be near each other, and photos of random names are no neighbors.
+    Poses that are wrong may not be near each other, and photos of random names are no neighbors. Photos from one place,
+    such as those of a bracket, fit whatever their poses are.
     """
     count = len(records)
     poses = np.stack([record.world_to_camera for record in records])
@@ -55,12 +58,12 @@ def candidate_pairs(records: Sequence[ImageRecord]) -> list[tuple[int, int]]:
     usual = float(np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))) or 1.0
     pairs: dict[tuple[int, int], None] = {}
     for i in range(0, count - 1, max(1, (count - 1) // (_MOST_PAIRS // 2))):
-        pairs[i, i + 1] = None
         apart = np.linalg.norm(centers - centers[i], axis=1) / usual
-        turned = 1 - poses[:, 2, :3] @ poses[i, 2, :3]
-        nearest = int(np.argmin(np.where(apart > _LEAST_BASELINE, apart + turned, np.inf)))
-        if nearest != i:
-            pairs[min(i, nearest), max(i, nearest)] = None
+        others = np.flatnonzero(apart > _LEAST_BASELINE)
+        turned = 1 - poses[others, 2, :3] @ poses[i, 2, :3]
+        following = others[others > i][:1]
+        for other in (*following, *others[np.argsort(apart[others] + turned)[:1]]):
+            pairs[min(i, int(other)), max(i, int(other))] = None
     return list(pairs)[:_MOST_PAIRS]
 
 
@@ -81,10 +84,13 @@ def shared_pixels(records: Sequence[ImageRecord], pairs: Sequence[tuple[int, int
     def features(index: int) -> tuple[Lens, np.ndarray, np.ndarray] | None:
         if (small := _small_photo(records[index])) is None:
             return None
-        points, descriptors = extractor.extract(Bitmap.from_array(small[1]))
+        lens, grey, mask = small
+        points, descriptors = extractor.extract(Bitmap.from_array(grey))
         places = np.array([(point.x, point.y) for point in points]).reshape(-1, 2)
         lengths = np.linalg.norm(descriptors.data.astype(np.float32), axis=1, keepdims=True)
-        return small[0], places, descriptors.data / lengths.clip(1e-6)
+        rows, columns = (np.clip(places[:, k].astype(int), 0, grey.shape[1 - k] - 1) for k in (1, 0))
+        used = mask[rows, columns]
+        return lens, places[used], (descriptors.data / lengths.clip(1e-6))[used]
 
     for i, j in pairs:
         if (first := features(i)) is not None and (second := features(j)) is not None:
@@ -93,8 +99,8 @@ def shared_pixels(records: Sequence[ImageRecord], pairs: Sequence[tuple[int, int
                 yield SharedPixels((i, j), (first[0], second[0]), (first[1][ours], second[1][theirs]))
 
 
-def _small_photo(record: ImageRecord) -> tuple[Lens, np.ndarray] | None:
-    """Return the grey codes [H, W] of a reduced photo, and its lens; None for one that cannot serve."""
+def _small_photo(record: ImageRecord) -> tuple[Lens, np.ndarray, np.ndarray] | None:
+    """Return the lens of a reduced photo, its grey codes and its mask [H, W]; None for one that cannot serve."""
     if record.lens.projection != "pinhole":
         return None
     try:
@@ -108,7 +114,11 @@ def _small_photo(record: ImageRecord) -> tuple[Lens, np.ndarray] | None:
             size = (lens.height, lens.width) if turn in (5, 6, 7, 8) else (lens.width, lens.height)
             image.draft("L", size)
             grey = image.convert("RGB").convert("L").resize(size, Image.Resampling.BOX)
-            return lens, turn_upright(np.asarray(grey), turn)
+        mask = np.ones((lens.height, lens.width), bool)
+        if record.mask is not None:
+            stored = Image.fromarray(read_mask(record.mask, oriented=oriented))
+            mask = np.asarray(stored.resize((lens.width, lens.height), Image.Resampling.BOX)) > _MASKED
+        return lens, turn_upright(np.asarray(grey), turn), mask
     except (InputError, *PILLOW_ERRORS):
         return None
 
@@ -147,4 +157,5 @@ def _epipolar_distance(
     # Signs of the depths in the first and the second camera at which the rays meet
     depths = (np.cross(theirs, (x, y, z)) * across).sum(1), (np.cross(turned, (x, y, z)) * across).sum(1)
     in_front = np.mean((depths[0] > 0) & (depths[1] > 0))
-    return float(np.nan_to_num(np.median(distances), nan=np.inf)) if in_front >= _IN_FRONT else np.inf
+    # A lens model may not hold in the corners, whose rays are NaN then.
+    return float(np.nanmedian(distances)) if in_front >= _IN_FRONT else np.inf

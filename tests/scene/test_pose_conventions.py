@@ -2,14 +2,18 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
+from sehdr_warp.scene.shared_pixels import SharedPixels, candidate_pairs, shared_pixels
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 LARGER = 2  # Times the embedded photos, in which few features are found
@@ -134,7 +138,7 @@ def test_conventions_of_other_programs_in_colmap_models_are_found(tmp_path, phot
 @pytest.mark.parametrize(
     ("lens", "words"),
     [
-        (lambda right: {"fl_x": 2 * right}, "a focal length of"),
+        (lambda right: {"fl_x": 2.02 * right}, "a focal length of"),
         (lambda right: {"fl_x": 2 * right, "cx": LARGER * 160, "cy": LARGER * 160}, "a focal length of"),
         (lambda right: {"k1": 6.0}, "it is read with no distortion"),
     ],
@@ -143,8 +147,65 @@ def test_a_lens_that_does_not_fit_the_photos_is_mended(tmp_path, photos, views, 
     right = LARGER * views[0].camera.fx
     folder = write_transforms(tmp_path, photos, views, lambda pose: np.linalg.inv(pose) @ FLIP, **lens(right))
     record = check(folder, views, words).records[0]
-    assert record.lens.focal[0] == pytest.approx(right, rel=0.06)
-    assert record.lens.is_pinhole and record.lens.centre == pytest.approx([LARGER * 80] * 2, rel=0.06)
+    assert record.lens.focal[0] == pytest.approx(right, rel=0.015)
+    assert record.lens.is_pinhole and record.lens.centre == pytest.approx([LARGER * 80] * 2, rel=0.015)
+
+
+def test_a_focal_length_that_no_lens_has_does_not_refuse_the_set(tmp_path, photos, views):
+    folder = write_transforms(tmp_path, photos, views, lambda pose: np.linalg.inv(pose) @ FLIP, fl_x=9.6)
+    assert {record.lens.focal for record in parse_dataset(folder, holdout=0).records} == {(9.6, 9.6)}
+
+
+def test_of_two_lenses_none_is_changed(tmp_path, photos, views):
+    """A mistake in one of them would spoil the other."""
+    folder = write_transforms(tmp_path, photos, views, lambda pose: np.linalg.inv(pose) @ FLIP)
+    right = LARGER * views[0].camera.fx
+    stated = json.loads((folder / "transforms.json").read_text())
+    stated["frames"] = [{**frame, "fl_x": right * (1 + (i < 11))} for i, frame in enumerate(stated["frames"])]
+    (folder / "transforms.json").write_text(json.dumps(stated))
+    focal = [record.lens.focal[0] for record in parse_dataset(folder, holdout=0).records]
+    assert focal == pytest.approx([2 * right] * 11 + [right] * 3)
+
+
+def test_photos_of_one_place_are_not_compared():
+    """Those of a bracket fit each other by any poses."""
+    thrice = [record for record in parse_dataset("embedded").records[:14] for _ in range(3)]
+    pairs = candidate_pairs(thrice)
+    assert len(pairs) >= 8
+    assert all(i // 3 != j // 3 for i, j in pairs)
+
+
+def test_masked_pixels_are_not_compared(tmp_path, photos, views):
+    """On a turntable the background stands still, whatever the poses."""
+    still = np.random.default_rng(0).integers(0, 255, (80, 80, 3), dtype=np.uint8)
+    background = Image.fromarray(still).resize((LARGER * 160, LARGER * 160), Image.Resampling.BICUBIC)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "turned").mkdir()
+    mask = Image.new("L", background.size)
+    mask.paste(255, (50, 70, 270, 250))
+    for i in range(len(views)):
+        photo = Image.composite(Image.open(photos / f"{i:02}.png"), background, mask)
+        photo.save(tmp_path / f"turned/{i:02}.png")
+        mask.save(tmp_path / f"masks/{i:02}.png")
+    write_transforms(tmp_path, tmp_path / "turned", views, lambda pose: np.linalg.inv(pose) @ FLIP)
+    records = parse_dataset(tmp_path, holdout=0).records
+    shared = list(shared_pixels(records, candidate_pairs(records)))
+    poses = [[records[i].world_to_camera for i in each.indices] for each in shared]
+    assert len(shared) >= 4
+    assert max(each.distance(each.lenses, *pose) for each, pose in zip(shared, poses, strict=True)) < 1
+
+
+def test_pixels_beyond_the_model_of_a_lens_do_not_count():
+    lens = Lens("RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3, 0.0), Path("cameras.txt"))
+    camera = pycolmap.Camera(model=lens.model, width=640, height=480, params=list(lens.params))
+    points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (100, 3))
+    first, second = np.eye(4), np.eye(4)
+    second[:3, 3] = -0.5, 0.1, 0.05
+    corner = np.full((1, 2), 3.0)
+    places = [np.concatenate([camera.img_from_cam(points + pose[:3, 3]), corner]) for pose in (first, second)]
+    assert np.isnan(camera.cam_from_img(corner)).all()
+    shared = SharedPixels((0, 1), (lens, lens), (places[0], places[1]))
+    assert shared.distance(shared.lenses, first, second) < 1e-6
 
 
 def test_the_check_is_made_once_and_again_if_a_pose_changes(tmp_path, photos, views, monkeypatch):
@@ -155,6 +216,17 @@ def test_the_check_is_made_once_and_again_if_a_pose_changes(tmp_path, photos, vi
     assert again.notes == first.notes and any("read as camera-to-world" in note for note in again.notes)
     write_transforms(tmp_path / "other", photos, [*views[1:], views[0]], np.linalg.inv)
     assert not any("poses: " in note for note in parse_dataset(tmp_path / "other", cache=tmp_path / "cache").notes)
+
+
+def test_the_check_is_made_again_once_the_size_of_the_photos_is_corrected(tmp_path, photos, views):
+    lens = {"w": LARGER * 320, "h": LARGER * 320, "cx": LARGER * 80, "cy": LARGER * 80}
+    poses = [tmp_path / "set", photos, views, lambda pose: np.linalg.inv(pose) @ FLIP]
+    write_transforms(*poses, **lens)
+    assert any(note.startswith("lens: ") for note in parse_dataset(poses[0], holdout=0, cache=tmp_path / "c").notes)
+    stated = json.loads((poses[0] / "transforms.json").read_text()) | {"w": LARGER * 160, "h": LARGER * 160}
+    (poses[0] / "transforms.json").write_text(json.dumps(stated))
+    mended = parse_dataset(poses[0], holdout=0, cache=tmp_path / "c")
+    assert mended.records[0].lens.focal[0] == pytest.approx(LARGER * views[0].camera.fx)
 
 
 def test_poses_that_fit_by_no_convention_are_named(tmp_path, photos, views):
