@@ -92,7 +92,10 @@ def find_photos(folder: Path) -> DataparserOutputs:
             notes.append(f"{place} is not read, because it has no cameras.bin or cameras.txt: cameras are found anew")
     if photos[0].parent == folder and (inner := _folders_with_photos(folder)):
         notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
-    records = (ImageRecord(photo.stem, photo, UNPLACED, np.eye(4), oriented=True) for photo in photos)
+    stems = Counter(fold_name(photo.stem) for photo in photos) if together else {}
+    views = [f"{photo.parent.name}_" * (stems.get(fold_name(photo.stem), 1) > 1) + photo.stem for photo in photos]
+    pairs = zip(views, photos, strict=True)
+    records = (ImageRecord(view, photo, UNPLACED, np.eye(4), oriented=True) for view, photo in pairs)
     names = tuple(photo.name for photo in copies)
     return DataparserOutputs("photos", tuple(records), notes=tuple(notes), mentioned=names)
 

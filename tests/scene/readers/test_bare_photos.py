@@ -93,6 +93,8 @@ def test_folders_of_one_camera_are_one_set(tmp_path, names):
     dataset = find_photos(tmp_path)
     first, second = (f"DCIM/{name}" for name in names)
     assert f"photos are read from the folders of one camera: {first} (4), {second} (2)" in dataset.notes
+    views = [f"{names[0]}_IMG_0", f"{names[0]}_IMG_1", "IMG_2", "IMG_3", f"{names[1]}_IMG_0", f"{names[1]}_IMG_1"]
+    assert [record.view for record in dataset.records] == views
     lens = Lens("SIMPLE_PINHOLE", 16, 12, (20.0, 8, 6), tmp_path)
     labels = [f"{names[0]}/IMG_0.jpg", f"{names[0]}/IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg", f"{names[1]}/IMG_1.jpg"]
     cameras = [PlacedPhoto(label, lens, index * np.eye(4), "train", 1.0) for index, label in enumerate(labels)]
