@@ -130,8 +130,10 @@ def render_views(
         )
         times = [entry.exposure_time for entry in run.cameras if entry.split == "train"] or [run.base_time]
         if max(times) > _SAME_EXPOSURE * min(times):
-            text = "0 EV of the brackets is %s, the photos' median exposure; they have %s to %s"
-            log.info(text, *map(shutter, (run.base_time, min(times), max(times))))
+            corrected = run.exposure_compensation is not None  # base_time is the median of corrected times.
+            median = "median exposure" + " corrected for drift" * corrected
+            text = "0 EV of the brackets is %s, the photos' %s; their times are %s to %s"
+            log.info(text, shutter(run.base_time), median, shutter(min(times)), shutter(max(times)))
     to_display: Callable[[np.ndarray], np.ndarray] | None = None
     if ocio is not None and view is not None:
         to_display = ocio_view(ocio, view, exposure_of_white(run, 1.0))

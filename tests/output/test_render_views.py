@@ -14,6 +14,7 @@ from sehdr_warp.output.images.tonemap import display_gain
 from sehdr_warp.output.render_views import render_views
 from sehdr_warp.own_files import LIST
 from sehdr_warp.scene import Camera, load_cameras
+from sehdr_warp.scene.exposure.compensation import ExposureCompensation
 
 from .helpers import AnalyticRun, Entry, camera, read_exr
 
@@ -316,5 +317,9 @@ def test_stops_count_from_the_median_exposure_of_photos_that_differ(tmp_path, lo
     for entry, time in zip(run.cameras, (0.5, 1 / 60, 2.0), strict=False):
         entry.exposure_time = time
     render_views(run, tmp_path / "mixed", evs=(-1, 0))
-    expected = "0 EV of the brackets is 0.5 s, the photos' median exposure; they have 1/60 s to 2 s"
+    expected = "0 EV of the brackets is 0.5 s, the photos' median exposure; their times are 1/60 s to 2 s"
     assert expected in logged
+    run.exposure_compensation = ExposureCompensation({entry.name: (1.0, 1.1, 1.0) for entry in run.cameras}, {})
+    run.base_time = 0.55
+    render_views(run, tmp_path / "drift", evs=(-1, 0))
+    assert expected.replace("0.5 s", "0.55 s").replace("exposure;", "exposure corrected for drift;") in logged
