@@ -51,6 +51,7 @@ __all__ = sorted(_HOME_OF)  # noqa: PLE0605 # pyright: ignore[reportUnsupportedD
 
 _RENAMED = {
     "Step": "TrainingProgress",
+    "Training": "create_trainer",
     "score_folder": "evaluate_folder",
     "write_panorama": "write_environment_map",
 }
