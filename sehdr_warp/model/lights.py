@@ -92,8 +92,8 @@ def light_name(index: int) -> str:
 @torch.no_grad()
 def received_light(
     field: RadianceField, position: np.ndarray, focal: float, *, beyond: float = 0.0, degree: int | None = None
-) -> Tensor:
-    """Return [N, 3], what a point receives of each Gaussian: radiance times the solid angle that nothing hides.
+) -> tuple[Tensor, Tensor]:
+    """Return what a point receives of each Gaussian: the solid angle [N] that nothing hides, and light [N, 3] from it.
 
     Args:
         field: a trained scene.
@@ -107,7 +107,7 @@ def received_light(
         place = torch.tensor(field.normalization.points(position), dtype=torch.float32)
         distance = (field.gaussians.means - place.to(field.gaussians.means.device)).norm(dim=1)
         opacities = field.gaussians.opacities() * (distance * field.normalization.unit >= beyond)
-    return _view_sums(field, _panorama(position, focal), degree, opacities)[2]
+    return _view_sums(field, _panorama(position, focal), degree, opacities)[1:]
 
 
 @torch.no_grad()
@@ -170,7 +170,7 @@ def find_lights(
     doubt = -confidence[members].clamp_min(2.0**-8).log2().cpu().numpy()
     shares = clipped.to(members.device)[members].cpu().numpy()
     covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
-    reaches_middle = received_light(field, middle, focal, degree=degree).mean(1)
+    reaches_middle = received_light(field, middle, focal, degree=degree)[1].mean(1)
     total = max(float(reaches_middle.sum()), 1e-30)
     lights = []
     for group in _groups(positions, REACH * float(np.median(widths))):

@@ -170,16 +170,20 @@ def lights_as_received(run: "RenderableScene", lights: Sequence[Light], center: 
     if not lights:
         return []
     focal = typical_focal_length(training_cameras(run))
-    received = received_light(run.field, center.position, focal, beyond=center.beyond, degree=run.degree)
+    angles, received = received_light(run.field, center.position, focal, beyond=center.beyond, degree=run.degree)
     result = []
     for light in lights:
-        angle = light.shape.solid_angle(center.position)
+        angle, of_members = light.shape.solid_angle(center.position), angles[light.members, None]
         if angle > 0:
-            radiance = run.in_rec709(received[light.members].sum(0)).cpu().numpy() / angle
+            # Radiance is converted, not what is received: sensor RGB is taken as white where it is above white.
+            rec709 = run.in_rec709(received[light.members] / of_members.clamp_min(1e-20))
+            radiance = (rec709 * of_members).sum(0).cpu().numpy() / angle
             gain = float(radiance.mean() / max(light.radiance.mean(), 1e-30))
             radiance *= min(1.0, MOST_GAIN / max(gain, 1e-30))
             bound = np.minimum(min(gain, 1.0) * light.lower_bound, radiance)
             light = replace(light, radiance=radiance, lower_bound=bound)
+        elif np.linalg.norm(light.shape.position - center.position) < center.beyond:
+            light = replace(light, radiance=np.zeros(3), lower_bound=np.zeros(3))
         result.append(light)
     return result
 

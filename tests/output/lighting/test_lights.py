@@ -44,11 +44,12 @@ def run(tmp_path, monkeypatch):
 
 
 def received(place):
-    """[6, 3] of the Gaussians: the first of each light gives all of its light."""
-    light = torch.zeros(6, 3, dtype=torch.float64)
+    """Solid angle [6] and light [6, 3] of the Gaussians: the first of each light gives all of its light."""
+    angles, light = torch.zeros(6, dtype=torch.float64), torch.zeros(6, 3, dtype=torch.float64)
     for each in LIGHTS:
+        angles[each.members[0]] = each.shape.solid_angle(place)
         light[each.members[0]] = torch.from_numpy(each.radiance * each.shape.solid_angle(place))
-    return light
+    return angles, light
 
 
 def test_json_has_every_figure(tmp_path, run):
@@ -144,23 +145,52 @@ def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
         run_lights(Lights(run=run.path, unseen="black"))
 
 
+def scene_of(tmp_path, places, light, widths):
+    """Opaque Gaussians with radiance [N, 3] and standard deviations [N, 3], of which photos clip those above 1."""
+    turns = np.tile(np.float32([1, 0, 0, 0]), (len(places), 1))
+    harmonics = (light[:, None] / 0.28209479).astype(np.float32)
+    opacity, scales = np.full(len(places), 6, np.float32), np.float32(np.log(widths))
+    field = field_of(GaussianArrays(np.float32(places), scales, turns, opacity, harmonics, "linear", 1.0))
+    # Photos from both sides of the origin.
+    eyes = [(x, y, 0.0) for x in (-1.5, -1.0, 1.0, 1.5) for y in (-0.6, 0.6)]
+    poses = [look_at(eye, (0, 0, 4), up=(0, -1, 0)) for eye in eyes]
+    photos = [Camera(160, 120, 100.0, 100.0, 80.0, 60.0, pose) for pose in poses]
+    run = Splats(tmp_path / "run", field, tuple(Entry(str(i), "train", each, 1.0) for i, each in enumerate(photos)))
+    run.clipped_share = lambda: torch.from_numpy(np.float32(light[:, 0] > 1))
+    return run
+
+
+def rows_of(run, file, **options):
+    """The lights that a file of a scene has."""
+    write_lights(run, file, axes="scene", overwrite=True, **options)
+    return json.loads(file.read_text())["lights"]
+
+
+def test_lamps_that_a_sensor_clips_in_all_channels_are_white_in_files(tmp_path):
+    run = scene_of(tmp_path, np.array([[2.0, 0, 4], [-2.0, 0, 4]]), np.full((2, 3), 300.0), np.full((2, 3), 0.06))
+    run.color_matrix = np.linalg.inv([[0.5, 0.1, 0.0], [0.1, 0.8, 0.1], [0.0, 0.2, 0.4]])
+    rows = rows_of(run, tmp_path / "lights.json", at=(0.0, 0.0, 0.0))
+    for light, row in zip(run.find_lights(), rows, strict=True):
+        assert row["radiance"] == pytest.approx(light.radiance, rel=0.03)
+        assert row["radiance"] == pytest.approx([row["radiance"][0]] * 3, rel=1e-3)
+
+
+def test_lights_nearer_than_beyond_give_nothing_wherever_they_face(tmp_path):
+    panel = np.stack(np.meshgrid(np.arange(-0.3, 0.31, 0.1), np.arange(-0.2, 0.21, 0.1), [4.0]), 3).reshape(-1, 3)
+    run = scene_of(tmp_path, panel, np.full(panel.shape, 300.0), np.tile([0.06, 0.06, 0.005], (len(panel), 1)))
+    for place in ((0.0, 0.0, 3.0), (0.0, 0.0, 5.0)):  # Before and behind the panel
+        (far,) = rows_of(run, tmp_path / "lights.json", at=place)
+        (near,) = rows_of(run, tmp_path / "lights.json", at=place, beyond=2.0)
+        assert far["shape"] == "rect" and far["radiance"] == pytest.approx([300] * 3, rel=0.1)
+        assert near["radiance"] == near["lower_bound"] == [0, 0, 0]
+
+
 def test_lights_and_rest_light_a_place_as_its_map_does(tmp_path):
     """Two lamps; a screen hides one from the place that is lit, though the photos show it."""
     screen = np.stack(np.meshgrid(np.arange(0.7, 1.5, 0.05), np.arange(-0.4, 0.4, 0.05), [2.0]), 3).reshape(-1, 3)
     places = np.concatenate([[[2.0, 0, 4]], [[-2.0, 0, 4]], screen])
     light = np.concatenate([np.full((2, 3), (300.0, 200.0, 100.0)), np.full(screen.shape, 0.2)])
-    widths = np.where(light[:, :1] > 1, 0.06, 0.04)
-    turns = np.tile(np.float32([1, 0, 0, 0]), (len(places), 1))
-    scales = np.float32(np.log(widths)).repeat(3, 1)
-    harmonics = (light[:, None] / 0.28209479).astype(np.float32)
-    opacity = np.full(len(places), 6, np.float32)
-    field = field_of(GaussianArrays(np.float32(places), scales, turns, opacity, harmonics, "linear", 1.0))
-    # Photos from both sides of the place: most see past the screen.
-    eyes = [(x, y, 0.0) for x in (-1.5, -1.0, 1.0, 1.5) for y in (-0.6, 0.6)]
-    poses = [look_at(eye, (0, 0, 4), up=(0, -1, 0)) for eye in eyes]
-    photos = [Camera(160, 120, 100.0, 100.0, 80.0, 60.0, pose) for pose in poses]
-    run = Splats(tmp_path / "run", field, tuple(Entry(str(i), "train", each, 1.0) for i, each in enumerate(photos)))
-    run.clipped_share = lambda: torch.tensor([1.0, 1.0] + [0.0] * len(screen))
+    run = scene_of(tmp_path, places, light, np.where(light > 1, 0.06, 0.04))
     listed = run.find_lights()
     assert len(listed) == 2 and listed[0].shape.position[0] < 0 and listed[1].share < 0.05 * listed[0].share
     assert listed[1].radiance == pytest.approx(listed[0].radiance, rel=0.3)
