@@ -94,10 +94,6 @@ def rasterize_directions(
     if not height * width:
         raise ValueError(f"directions has shape {list(directions.shape)}, expected [H, W, 3] with at least one pixel")
     check_directions(directions)
-    if directions.requires_grad and torch.is_grad_enabled():
-        raise ValueError(
-            "directions requires a gradient, and there is none with respect to it; pass directions.detach()"
-        )
     footprint = EPS2D / focal_length**2
     smoothing = max(EPS2D * pixel_angle**2 - footprint, 0.0)
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[1])):
@@ -109,7 +105,7 @@ def rasterize_directions(
         opacities = splats.opacities.masked_fill(~features.isfinite().all(1), 0)
         blended = splats.caps, splats.across, splats.along, opacities, features.contiguous()
         keep_emit_order = means.is_cpu and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in blended)
-        directions = directions.detach().contiguous()
+        directions = directions.contiguous()
         lists = _list_tiles(splats.caps.detach(), splats.distances, directions, keep_emit_order)
         return _Blend.apply(*blended, directions, lists, alpha_threshold)
 
