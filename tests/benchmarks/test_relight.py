@@ -56,7 +56,7 @@ def test_an_emitter_lights_as_its_map_does(mi, shape, columns, monkeypatch):
     # Of each ball the light, and where on the ball it is.
     for part in range(3):
         true, measured = (image[:, 16 * part : 16 * part + 16].mean(2) for image in (lit, ours))
-        assert true.mean() > 0.001 and measured.mean() == pytest.approx(true.mean(), rel=0.15)
+        assert true.mean() > 0.001 and measured.mean() == pytest.approx(true.mean(), rel=0.2)
         middles = [
             np.average(np.mgrid[:16, :16], axis=(1, 2), weights=np.stack([each, each])) for each in (true, measured)
         ]
