@@ -107,10 +107,14 @@ class RenderableScene:
         With `average`, a pinhole view that is coarser than the photos is rendered as finely as they are and averaged.
         Without it, which is faster, lamps smaller than a pixel get 0.7 to 1.6 times their light, and edges are rough.
         """
-        factor = samples_across_pixel(self.field, camera) if average else 1
+        factor = self.samples_across_pixel(camera) if average else 1
         finer = camera.resized(factor * camera.width, factor * camera.height)
         view = as_rec709(self.field.render(finer, degree=self.degree), self.color_matrix, self.field)
         return view.reduced(factor)
+
+    def samples_across_pixel(self, camera: Camera) -> int:
+        """Return how many times finer than a camera's pixels render() renders what it averages; at least 1."""
+        return samples_across_pixel(self.field, camera)
 
     def render_directions(
         self, position: np.ndarray, directions: np.ndarray, *, focal_length: float, pixel_angle: float, **more: Any

@@ -7,7 +7,10 @@ import time
 
 import pytest
 
+from sehdr_warp import load_run
 from sehdr_warp.viewer import connections
+from sehdr_warp.viewer.clients import SavedRun
+from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import MOST_SAVED, Server
 
 from ..output.helpers import AnalyticRun, camera
@@ -147,3 +150,17 @@ def test_a_server_for_this_machine_alone_has_no_other_names(serve, host):
         assert not server.allowed(name, None)
     assert not server.allowed(f"{host}:{port}", "http://evil.example")
     server.server_close()
+
+
+def test_a_small_save_that_is_averaged_waits_as_a_picture_of_its_finer_pixels(embedded_run):
+    run, sizes = load_run(embedded_run), []
+
+    def on_renderer(client, make, pixels):
+        sizes.append(pixels)
+        return make()
+
+    saved, photo = SavedRun(on_renderer, ViewerScene(run, "run"), None), run.cameras[0].camera
+    small = photo.resized(photo.width // 2, photo.height // 2)
+    for average in (True, False):
+        assert saved.render(small, average=average).hdr.shape == (small.height, small.width, 3)
+    assert sizes == [4 * small.width * small.height, small.width * small.height]
