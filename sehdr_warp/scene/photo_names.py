@@ -7,7 +7,6 @@ the forms in which Unicode writes an accent, do not matter. Of several names the
 
 import os
 import unicodedata
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -23,11 +22,9 @@ def fold_name(name: str) -> str:
 
 
 def photo_labels(images: Sequence[Path]) -> list[str]:
-    """Return the file name of each photo, with its folder in front if photos of several folders share the name."""
-    counts = Counter(fold_name(image.name) for image in images)
-    return [
-        f"{image.parent.name}/{image.name}" if counts[fold_name(image.name)] > 1 else image.name for image in images
-    ]
+    """Return the file name of each photo, with its folder in front if the photos lie in several folders."""
+    several = len({image.parent for image in images}) > 1
+    return [f"{image.parent.name}/{image.name}" if several else image.name for image in images]
 
 
 def bases_of(images: Sequence[Path], folder: Path) -> list[Path]:

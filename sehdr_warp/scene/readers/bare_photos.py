@@ -168,15 +168,16 @@ def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> 
     """
     by_name: dict[str, list[int]] = {}
     for number, camera in enumerate(cameras):
-        for key in {camera.file, "folded " + fold_name(camera.file)}:
+        for key in {camera.file, "folded " + fold_name(camera.file), "alone " + fold_name(Path(camera.file).name)}:
             by_name.setdefault(key, []).append(number)
     placed, others, names = [], [], photo_labels([record.image for record in dataset.records])
     left = set(range(len(cameras)))
     for index, (record, name) in enumerate(zip(dataset.records, names, strict=True)):
-        # Runs may state the file name alone of photos that share it, in their order.
-        keys = [name, record.image.name]
-        keys += ["folded " + fold_name(key) for key in keys]
-        if (number := next((n for key in keys for n in by_name.get(key, ()) if n in left), None)) is None:
+        numbers = [*by_name.get(name, ()), *by_name.get("folded " + fold_name(name), ())]
+        # The run or the photos may have the file names alone, as of photos that were copied into one folder since.
+        alone = by_name.get("alone " + fold_name(record.image.name), ())
+        numbers += [n for n in alone if "/" not in name or "/" not in cameras[n].file]
+        if (number := next((n for n in numbers if n in left), None)) is None:
             others.append(index)
         else:
             left.remove(number)

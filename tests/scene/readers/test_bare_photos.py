@@ -13,6 +13,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene.dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto, PointCloud
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
+from sehdr_warp.scene.photo_names import photo_labels
 from sehdr_warp.scene.readers import bare_photos
 from sehdr_warp.scene.readers.bare_photos import find_photos, with_cameras
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
@@ -96,12 +97,15 @@ def test_folders_of_one_camera_are_one_set(tmp_path, names):
     views = [f"{names[0]}_IMG_0", f"{names[0]}_IMG_1", "IMG_2", "IMG_3", f"{names[1]}_IMG_0", f"{names[1]}_IMG_1"]
     assert [record.view for record in dataset.records] == views
     lens = Lens("SIMPLE_PINHOLE", 16, 12, (20.0, 8, 6), tmp_path)
-    labels = [f"{names[0]}/IMG_0.jpg", f"{names[0]}/IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg", f"{names[1]}/IMG_1.jpg"]
-    cameras = [PlacedPhoto(label, lens, index * np.eye(4), "train", 1.0) for index, label in enumerate(labels)]
+    run = [0, 2, 3, 4, 5]  # IMG_1.jpg of the first folder could not be placed.
+    labels = photo_labels([dataset.records[index].image for index in run])
+    cameras = [PlacedPhoto(label, lens, i * np.eye(4), "train", 1.0) for i, label in zip(run, labels, strict=True)]
     placed = parse_dataset(tmp_path, cameras=cameras)
-    assert [record.world_to_camera[0, 0] for record in placed.records] == [0, 1, 2, 3, 4]
-    assert [record.image.parent.name for record in placed.records] == [names[0]] * 4 + [names[1]]
-    assert f"1 photo is not in the run and is left out: {names[1]}/IMG_0.jpg" in placed.notes
+    assert [record.world_to_camera[0, 0] for record in placed.records] == run
+    assert [record.image for record in placed.records] == [dataset.records[index].image for index in run]
+    assert f"1 photo is not in the run and is left out: {names[0]}/IMG_1.jpg" in placed.notes
+    one = parse_dataset(tmp_path / first, cameras=cameras[:3])  # Not as of several folders
+    assert [record.world_to_camera[0, 0] for record in one.records] == run[:3]
 
 
 def test_folders_of_two_cameras_are_not_joined(tmp_path):
