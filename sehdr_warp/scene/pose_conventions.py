@@ -22,6 +22,8 @@ from .shared_pixels import SharedPixels, candidate_pairs, shared_pixels
 
 POSED = ("transforms", "colmap", "llff", "opensfm")
 """Layouts whose cameras are checked."""
+MISFIT = "does not fit the photos, by no convention"
+"""Words of the note on cameras that no reading mends."""
 _VERSION = 2  # Raised with every change of results
 _AXES = {  # From a camera's axes to OpenCV's: x right, y down, z ahead
     "OpenCV's": np.eye(3),
@@ -186,7 +188,7 @@ def _verdict(records: Sequence[ImageRecord], layout: str, pairs: Sequence[tuple[
         fit = f"which fits the photos ({np.median(readings[reading]):.1f} pixels)"
         return _Verdict(reading, note=f"poses: {far}; they are read {reading} instead, {fit}")
     remedy = "to find the cameras anew, give a folder with the photos alone"
-    return _Verdict(note=f"poses: {file} does not fit the photos, by no convention: {far}; {remedy}")
+    return _Verdict(note=f"poses: {file} {MISFIT}: {far}; {remedy}")
 
 
 def _fit(distances: Sequence[float]) -> bool:

@@ -10,6 +10,7 @@ from ..runs.config_files import config_fields, flag_text
 from ..runs.run import Run
 from ..runs.scene_description import FOUND
 from ..runs.values import LOAD_OPTIONS, LoadArguments
+from ..scene.pose_conventions import MISFIT
 from ..subsets import first_names
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ UNFINISHED = 0.5  # dB gained there from which blur explains what differs from t
 FALLING = 0.5  # dB that they lost since their best in a training that overfits; seeds differ by up to 0.3 dB
 EXPOSURE_JUMP = 0.4  # Stops between a whole photo and the scene from which its exposure is not as stated
 FAILED = 17.0  # dB of held-out photos below which the scene as a whole is wrong: sound captures have 19 to 35
-_MISFIT = "not fit the photos, by no convention"  # Of a note on poses; see scene.pose_conventions
 _FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
@@ -54,9 +54,11 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
     words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
     summary = run.summary() | {"metrics": run.metrics()}
     scene, unplaced = data.get("path") or "SCENE", trainer.scene.unplaced
-    source = trainer.scene.views[0].source
-    posed = str(source.parent) if source is not None and trainer.scene.format not in FOUND else None
-    misfit = any(_MISFIT in note for note in trainer.scene.notes)
+    folders = {str(view.source.parent) for view in trainer.scene.views if view.source is not None}
+    posed = None
+    if folders and trainer.scene.format not in FOUND:
+        posed = folders.pop() if len(folders) == 1 else scene  # No folder holds the photos of several alone.
+    misfit = any(MISFIT in note for note in trainer.scene.notes)
     return advice(run.path, summary, photos, scene, words, trainer.first_iteration, unplaced, steps, posed, misfit)
 
 

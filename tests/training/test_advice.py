@@ -1,8 +1,11 @@
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 from sehdr_warp.runs.config_files import load_config, value_of
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.training.advice import advice, option_words, options_of_run
+from sehdr_warp.scene.pose_conventions import MISFIT
+from sehdr_warp.training.advice import advice, advice_on, option_words, options_of_run
 from sehdr_warp.training.train import train
 
 from .toy import toy_scene
@@ -109,6 +112,21 @@ def test_a_scene_that_fits_nowhere_blames_cameras_and_overlap_and_nothing_that_m
     assert line.startswith("the cameras that the set states do not fit its photos") and "set/images" in line
     [line] = advice(Path("r"), figures, 54, "set", posed="set")  # Beside the file of their poses
     assert line.endswith("in a folder PHOTOS of their own: sehdr-warp train PHOTOS --out r --overwrite")
+
+
+def test_cameras_are_found_anew_from_all_photos():
+    """Not from one of the folders of a rig."""
+    scene = toy_scene(4, 8)
+    run = SimpleNamespace(path=Path("r"), summary=lambda: summary([22]), metrics=list)
+    config = SimpleNamespace(plan=SimpleNamespace(keep=[]))
+    facts = {"run": run, "iteration": 3, "total": 3, "first_iteration": 0, "config": config}
+    for folders, end in ((["a", "a"], "alone: sehdr-warp train set/a"), (["a", "b"], "own: sehdr-warp train PHOTOS")):
+        places = [Path("set", folder, view.name) for folder, view in zip(2 * folders, scene.views, strict=True)]
+        views = tuple(replace(view, source=place) for view, place in zip(scene.views, places, strict=True))
+        rig = replace(scene, views=views, format="colmap", notes=(f"poses: images.txt {MISFIT}: far",))
+        [line] = advice_on(SimpleNamespace(scene=rig, **facts), {"path": "set"}, {})
+        assert line.startswith("the cameras that the set states do not fit its photos")
+        assert line.endswith(f"{end} --out r --overwrite")
 
 
 def test_a_finished_run_goes_on_with_more_iterations(tmp_path, logged):
