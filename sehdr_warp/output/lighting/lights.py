@@ -123,7 +123,7 @@ def write_lights(
     for file in files:
         check_absent(file, overwrite)
     if suffix == ".json" and unseen != "inpaint":
-        raise SehdrError(f"{path}: unseen is of the dome's map, which .json has not; write .usda")
+        raise SehdrError(f"{path}: unseen is for the map of a dome light, and .json has none; write .usda")
     transform = world_transform(run, axes, up=up, scale=scale)
     center = find_center(run, training_cameras(run), at, beyond, transform)
     factor, unit = exposure_of_white(run, reference_white), "relative radiance"
