@@ -180,7 +180,7 @@ def locked(kind: str, space: Path) -> None:
 def test_locks_that_are_no_locks(space, kind, line):
     (space / "precious").write_text("mine")
     locked(kind, space)
-    ended = tried(space, line, made=("run",))
+    ended = tried(space, line, made=("run", "cache"))
     assert (ended.code == 0) == (kind in ("text", "sparse", "pipe"))
 
 
@@ -235,7 +235,7 @@ def test_sets_that_changed_below_a_training(space, kind):
     change_set(kind, space / "photos")
     before = files_in(space / "run")
     line = "train photos --resume --out run --iterations 26 --device cpu -q"
-    ended = tried(space, line, codes=(0,) if kind in SAME else (0, 1), made=("run",))
+    ended = tried(space, line, codes=(0,) if kind in SAME else (0, 1), made=("run", "cache"))
     assert (ended.code == 0) == (kind in SAME), f"{kind}: went on without a word"
     assert ended.code == 0 or files_in(space / "run") == before
 
