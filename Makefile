@@ -10,7 +10,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 DEMO ?= runs/demo
-# About 70 s of training on two idle cores.
+# 70 to 105 s of training on two idle cores.
 DEMO_FIELDS = --densification.cap-max 40000 --model.initial-density 14
 PYTEST ?= -q -n auto --dist worksteal
 
