@@ -26,8 +26,8 @@ def available_devices() -> list[str]:
 def pytest_ignore_collect(collection_path, config):
     """Leave out tests/trial, a third of all tests, unless -m or a path asks for it."""
     folder = ROOT / "tests" / "trial"
-    asked = config.option.markexpr != "not trial" or any("trial" in argument for argument in config.args)
-    return True if collection_path == folder and not asked else None
+    with_trials = config.option.markexpr != "not trial" or any("trial" in argument for argument in config.args)
+    return True if collection_path == folder and not with_trials else None
 
 
 def pytest_generate_tests(metafunc):

@@ -214,8 +214,8 @@ def build_tile_lists(
         keys, gaussians, length, packed, grid, keep_emit_order
     )
     # Copies, because order and total are views that would keep larger buffers.
-    kept = EmitOrder(order.clone(), cumulative_counts) if keep_emit_order else None
-    lists = tile_ranges, gaussians, subtile_masks, kept, emit_indices
+    order_copy = EmitOrder(order.clone(), cumulative_counts) if keep_emit_order else None
+    lists = tile_ranges, gaussians, subtile_masks, order_copy, emit_indices
     return TileLists(*lists, width, height, overflow, total.clone())
 
 

@@ -57,8 +57,8 @@ def fisheye_angles(projection: str, distortion: tuple, radius: np.ndarray) -> np
     """Return the angles from the axis, radians, that a fisheye lens shows at radii in focal lengths; NaN beyond."""
     theta = np.linspace(0, np.pi, 8192)
     bent = _fisheye_radii(projection, distortion, theta)
-    seen = np.isfinite(bent)
-    return np.interp(radius, bent[seen], theta[seen], right=np.nan)
+    visible = np.isfinite(bent)
+    return np.interp(radius, bent[visible], theta[visible], right=np.nan)
 
 
 def _fisheye_radii(projection: str, distortion: tuple, theta: np.ndarray) -> np.ndarray:

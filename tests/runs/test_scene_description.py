@@ -1,4 +1,4 @@
-"""What scene.json says of photos whose cameras structure from motion found."""
+"""Store cameras that structure from motion found in scene.json, and find their photos again."""
 
 from dataclasses import replace
 from pathlib import Path

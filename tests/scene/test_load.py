@@ -1,4 +1,4 @@
-"""What load_scene does with splits, names, responses, the embedded scene and folders of photos."""
+"""Load sets: splits, names, responses, the embedded scene and folders of photos."""
 
 import os
 import subprocess

@@ -168,7 +168,7 @@ def test_of_two_lenses_none_is_changed(tmp_path, photos, views):
 
 
 def test_photos_of_one_place_are_not_compared():
-    """Those of a bracket fit each other by any poses."""
+    """Pairs of one bracket fit any poses."""
     thrice = [record for record in parse_dataset("embedded").records[:14] for _ in range(3)]
     pairs = candidate_pairs(thrice)
     assert len(pairs) >= 8

@@ -51,8 +51,8 @@ def test_a_lens_shows_nothing_beyond_its_widest_angle():
     camera = Camera(200, 200, 60.0, 60.0, 100.0, 100.0, np.eye(4), "SIMPLE_RADIAL_FISHEYE", (-0.1,))
     angles = np.radians([0, 60, 104, 106, 150, 179, 180])
     directions = np.stack([np.sin(angles), np.zeros(7), np.cos(angles)], 1)
-    shown = np.isfinite(pixels_of_directions(directions, camera)).all(1)
-    assert shown.tolist() == [True, True, True, False, False, False, False]
+    visible = np.isfinite(pixels_of_directions(directions, camera)).all(1)
+    assert visible.tolist() == [True, True, True, False, False, False, False]
     assert len(faces_of(colored(camera))) == 5, "none of what is behind"
 
 

@@ -49,7 +49,7 @@ _POSE_CONTENT = {
     ".xml": (b"<chunk", "Metashape"), ".csv": (b"#name,x,y", "RealityScan"), ".xmp": (b"xcr:", "RealityScan"),
     ".out": (b"Bundle file", "Bundler"), ".json": (b'"cameraPoseARFrame"', "3D Scanner App"),
 }  # fmt: skip
-_MEDIA = (*VIDEO_SUFFIXES, *UNSTITCHED_SUFFIXES, *HEIF_SUFFIXES)  # Which a user may mean beside a folder of photos
+_MEDIA = frozenset().union(VIDEO_SUFFIXES, UNSTITCHED_SUFFIXES, HEIF_SUFFIXES)  # May be meant beside a folder of photos
 _CAMERA_FOLDER = re.compile(r"\d{6}_[a-z_]|\d{3}([a-z0-9_]{5})")  # 202410__ of an iPhone, and 100CANON
 _ALIKE = 5.0  # Degrees; 1.8 between sets of 9 photos of which one has 49 points, 8 and more if people or objects move
 _MOST_READ = 20  # Files of one suffix whose content is looked at
