@@ -11,7 +11,7 @@ import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.baking import sphere_directions
-from sehdr_warp.model.lights import LightShape
+from sehdr_warp.model.light_shapes import LightShape
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
 from sehdr_warp.output.lighting.lights import lights_as_received
 from sehdr_warp.output.lighting.map_center import MapCenter

@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from ..scene import Camera
 from ..scene.wide_camera import pixels_of_directions, steradians, typical_focal_length
 from ..subsets import every_nth
 from .confidence import RESIDUAL_WEIGHT
+from .light_shapes import LightShape, connected_groups, fit_solid_angles, fitted_shape, solid_angles
 from .radiance_field import RadianceField
 
 CLIPPED = 0.3  # Share of the values of photos too bright for a Gaussian that clip, from which it can belong to a light
@@ -19,7 +21,6 @@ BRIGHT = 0.7  # Times white, from which a Gaussian can belong to a light, and fr
 MOST_CLIPPED = 0.1  # Share of all photos' pixels that may clip at the exposure whose white decides what a light is
 LEAST_SEEN = 0.3  # Pixels of blending weight over all views, likewise
 REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
-FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras, if nothing hides the light from there
 MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
@@ -28,35 +29,6 @@ MOST_LIGHTS, MOST_VIEWS = 64, 24  # MOST_VIEWS of the longest exposures, and of 
 LEAST_ROWS, MOST_ROWS = 128, 724
 """Rows of the map in which the light at a point is measured: as fine as the photos' pixels, within these bounds. In
 coarser pixels small Gaussians would no longer hide each other."""
-
-
-@dataclass(frozen=True, eq=False)
-class LightShape:
-    """A rectangle or a sphere, in the scene's coordinates.
-
-    Attributes:
-        kind: "rect" or "sphere".
-        position: [3] middle.
-        axes: [3, 3] rows: along the width, along the height, and the direction that a rectangle emits to.
-        size: width and height of a rectangle; the diameter of a sphere, twice.
-    """
-
-    kind: str
-    position: np.ndarray
-    axes: np.ndarray
-    size: tuple[float, float]
-
-    def solid_angle(self, point: np.ndarray) -> float:
-        """Return the solid angle that a point sees of a light; 0 from behind a rectangle, 2 pi within a sphere."""
-        towards = self.axes @ (point - self.position)
-        if self.kind == "sphere":
-            sine = min(self.size[0] / 2 / max(float(np.linalg.norm(towards)), 1e-12), 1.0)
-            return float(2 * np.pi * sine**2 / (1 + np.sqrt(1 - sine**2)))
-        if towards[2] <= 0:
-            return 0.0
-        u, v = (towards[i] + np.array([0.5, -0.5]) * self.size[i] for i in (0, 1))
-        corners = np.arctan2(np.outer(u, v), towards[2] * np.sqrt(u[:, None] ** 2 + v**2 + towards[2] ** 2))
-        return float(corners[0, 0] - corners[0, 1] - corners[1, 0] + corners[1, 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +61,25 @@ def light_name(index: int) -> str:
     return f"light_{index}"
 
 
+class ReceivedLight(NamedTuple):
+    """Light that a camera or a point receives of each Gaussian.
+
+    Attributes:
+        pixels: [N] sums of its blending weights over the pixels.
+        angles: [N] solid angle that nothing hides, steradians.
+        light: [N, 3] radiance times this angle.
+    """
+
+    pixels: Tensor
+    angles: Tensor
+    light: Tensor
+
+
 @torch.no_grad()
 def received_light(
     field: RadianceField, position: np.ndarray, focal: float, *, beyond: float = 0.0, degree: int | None = None
-) -> tuple[Tensor, Tensor]:
-    """Return what a point receives of each Gaussian: the solid angle [N] that nothing hides, and light [N, 3] from it.
+) -> ReceivedLight:
+    """Return what a point receives of each Gaussian.
 
     Args:
         field: a trained scene.
@@ -107,7 +93,7 @@ def received_light(
         place = torch.tensor(field.normalization.points(position), dtype=torch.float32)
         distance = (field.gaussians.means - place.to(field.gaussians.means.device)).norm(dim=1)
         opacities = field.gaussians.opacities() * (distance * field.normalization.unit >= beyond)
-    return _view_sums(field, _panorama(position, focal), degree, opacities)[1:]
+    return _received_by(field, _panorama(position, focal), degree, opacities)
 
 
 @torch.no_grad()
@@ -128,89 +114,207 @@ def find_lights(
     """
     if not views:
         return []
-    times = np.array([time for _, time in views])
-    longest = times > times.max() / 2
-    middle = np.mean([camera.position for camera, _ in views], axis=0)
-    sample = [index for part in (longest, ~longest) for index in every_nth(part.nonzero()[0], MOST_VIEWS)]
-    cameras, whites = [views[index][0] for index in sample], field.response.white / times[sample]
-    focal = typical_focal_length(cameras)
-
-    @cache
-    def sums_around(index: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what all directions from a photo's place receive, as of _view_sums()."""
-        return _view_sums(field, _panorama(cameras[index].position, focal), degree)
-
-    sums = [_view_sums(field, camera, degree) for camera in cameras]
-    pixels, angles, flux = (sum(parts) for parts in zip(*sums, strict=True))
-    mean = flux / angles.clamp_min(1e-20)[:, None]  # pyright: ignore[reportAttributeAccessIssue]
-    peak = mean.amax(1)
-    most = field.response.white / float(np.quantile(times, 0.75, method="lower"))
-    white = _reference_white(np.minimum(whites, most), peak, pixels)  # pyright: ignore[reportArgumentType]
-    # Photos of half the exposure or less measure lights and do not clip them, so these do not count.
-    usual = [(part[0], each) for part, each in zip(sums, whites, strict=True) if each < 2 * white]
-    too_bright = torch.zeros_like(peak)
-    for seen, each in usual:
-        too_bright += seen * (peak > BRIGHT * each)
-    # The share is lower if the scene contradicts the other photos, which then weigh more.
-    weighted = too_bright + RESIDUAL_WEIGHT * (pixels - too_bright)
-    clips = clipped.to(mean.device) >= CLIPPED * too_bright / weighted.clamp_min(1e-20)
-    members = (clips & (pixels > LEAST_SEEN) & (peak > BRIGHT * white)).nonzero()[:, 0]
-    # Radiance up to which each photo measures what photos of the reference exposure clip.
-    measurable = np.where(whites >= 2 * white, whites, 0.0)
-    if not len(members):
+    photos = _measure_photos(field, views, degree)
+    candidates = _candidates(field, clipped, photos)
+    if not len(candidates.index):
         return []
-    gaussians = field.gaussians
-    positions = field.normalization.scene_points(gaussians.means[members].cpu().numpy())
-    widths = gaussians.log_scales[members].exp().amax(1).cpu().numpy() * field.normalization.unit
-    weights = (pixels * mean.mean(1))[members].cpu().numpy()
-    certain = (too_bright > 0)[members].cpu().numpy()
-    brightness = peak[members].cpu().numpy()
-    uncertainty = None if field.clipped_stops is None else field.clipped_stops.to(members.device)[members].cpu().numpy()
-    confidence = torch.ones_like(peak) if field.confidence is None else field.confidence.to(peak.device)
-    doubt = -confidence[members].clamp_min(2.0**-8).log2().cpu().numpy()
-    shares = clipped.to(members.device)[members].cpu().numpy()
-    covered, received = (np.stack([part[i][members].cpu().numpy() for part in sums]) for i in (1, 2))
-    reaches_middle = received_light(field, middle, focal, degree=degree)[1].mean(1)
+    middle = np.mean([camera.position for camera, _ in views], axis=0)
+    reaches_middle = received_light(field, middle, photos.focal, degree=degree).light.mean(1)
     total = max(float(reaches_middle.sum()), 1e-30)
+    panoramas: dict[int, ReceivedLight] = {}
     lights = []
-    for group in _groups(positions, REACH * float(np.median(widths))):
-        if weights[group] @ certain[group] < CLIPPED * weights[group].sum():
+    for rows in connected_groups(candidates.positions, REACH * float(np.median(candidates.widths))):
+        group = candidates.rows(rows)
+        if group.weights @ group.too_bright < CLIPPED * group.weights.sum():
             continue  # Darker photos alone show most of it and do not clip it, as the part of a walk in the sun.
-        shape = _shape(positions[group], widths[group], weights[group], middle)
-        whole = [_in_frame(camera, positions[group], widths[group], weights[group]) for camera in cameras]
-        angles_of_shape = np.array([shape.solid_angle(camera.position) for camera in cameras])
-        holding = np.flatnonzero(whole & (angles_of_shape > 0))
-        area_sums, light_sums = covered[:, group].sum(1, keepdims=True)[holding], received[:, group].sum(1)[holding]
-        if not len(holding):
+        shape = fitted_shape(group.positions, group.widths, group.weights, middle)
+        shown = _photos_of_whole_light(photos.cameras, group, shape)
+        if not len(shown.photos):
             # Every photo cuts the light off at its border. The one that shows most of it looks beyond that.
-            best = int(np.argmax(covered[:, group].sum(1) * (angles_of_shape > 0)))
-            part = [values[members][group].cpu().numpy().sum(0) for values in sums_around(best)[1:]]
-            holding, area_sums, light_sums = np.array([best]), part[0].reshape(1, 1), part[1][None]
-        # Something hides the light from views that show far less of it than others.
-        fractions = area_sums[:, 0] / angles_of_shape[holding]
-        unobstructed = fractions >= UNOBSTRUCTED * np.quantile(fractions, 0.9)
-        area_sums, light_sums, holding = area_sums[unobstructed], light_sums[unobstructed], holding[unobstructed]
-        places = [cameras[index].position for index in holding]
-        area = float(_fit(shape, area_sums, places)[0])
+            best = int(np.argmax(group.angles.sum(1) * (solid_angles(shape, photos.cameras) > 0)))
+            if best not in panoramas:
+                panoramas[best] = _received_by(field, _panorama(photos.cameras[best].position, photos.focal), degree)
+            around = panoramas[best]
+            shown = _Shown(
+                np.array([best]),
+                around.angles[group.index].sum(0, keepdim=True).cpu().numpy(),
+                around.light[group.index].sum(0, keepdim=True).cpu().numpy(),
+            )
+        shown = shown.without_obstructed(solid_angles(shape, photos.cameras))
+        if not len(shown.photos):
+            continue  # A flat light at whose edge all cameras stand.
+        places = [photos.cameras[index].position for index in shown.photos]
+        area = float(fit_solid_angles(shape, shown.angles[:, None], places)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
         sides = [side * min(max(area, 1e-4), 1e4) ** 0.5 for side in shape.size]
         shape = replace(shape, size=(sides[0], sides[1]))
-        radiance = _fit(shape, light_sums, places)
-        deviation = None
-        if uncertainty is not None:
-            clip = np.maximum(shares[group], 1e-6)
-            stops = uncertainty[group] / clip
-            measured = brightness[group] < measurable[holding].max()
-            # The scene may contradict the photos that measure it.
-            misfit = np.maximum(doubt[group] - uncertainty[group], 0) / np.maximum(1 - shares[group], 1e-6)
-            stops[measured] = np.minimum(stops, np.maximum(misfit, MEASURED_STOPS))[measured]
-            deviation = float(np.average(stops, weights=weights[group] * clip))
-        index = members[torch.from_numpy(group).to(members.device)]
-        share = float(reaches_middle[index].sum()) / total
-        if radiance.mean() * shape.solid_angle(middle) >= LEAST_SHARE * total:  # Also if something hides it from there
-            bound = np.minimum(white, radiance)
-            lights.append(Light(shape, radiance, bound, deviation, share, index))
+        radiance = fit_solid_angles(shape, shown.light, places)
+        if radiance.mean() * shape.solid_angle(middle) < LEAST_SHARE * total:
+            continue
+        deviation = _deviation(group, float(photos.measurable[shown.photos].max()))
+        share = float(reaches_middle[group.index].sum()) / total
+        bound = np.minimum(photos.white, radiance)
+        lights.append(Light(shape, radiance, bound, deviation, share, group.index))
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
+
+
+@dataclass(frozen=True, eq=False)
+class _Photos:
+    """Sample of V photos, and what they receive of the N Gaussians of a scene.
+
+    Attributes:
+        cameras: of the photos, in the scene's coordinates.
+        received: by each photo.
+        white: radiance that lights exceed.
+        measurable: [V] radiance up to which a photo measures what photos of that white clip; 0 if it clips as early.
+        focal: typical focal length, pixels.
+        whites: [V] radiance that each photo clips at.
+        pixels: [N] sums over the photos.
+        radiance: [N, 3] mean towards the photos.
+    """
+
+    cameras: list[Camera]
+    received: list[ReceivedLight]
+    white: float
+    measurable: np.ndarray
+    focal: float
+    whites: np.ndarray
+    pixels: Tensor
+    radiance: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """K Gaussians that can belong to lights, and what V photos receive of them.
+
+    Attributes:
+        index: [K] int64, in the scene, on its device.
+        positions: [K, 3], scene coordinates.
+        widths: [K] largest standard deviation, scene units.
+        weights: [K] radiance times pixels.
+        brightness: [K] radiance of the brightest channel.
+        too_bright: [K] whether a photo of the usual exposure clips it.
+        clipped: [K] in [0, 1], which share of its values clips.
+        stops: [K] deviation of log2 radiance, of its whole light; None if it was not measured.
+        doubt: [K] stops of its confidence.
+        angles: [V, K] solid angles that photos see.
+        light: [V, K, 3] radiance times these.
+    """
+
+    index: Tensor
+    positions: np.ndarray
+    widths: np.ndarray
+    weights: np.ndarray
+    brightness: np.ndarray
+    too_bright: np.ndarray
+    clipped: np.ndarray
+    stops: np.ndarray | None
+    doubt: np.ndarray
+    angles: np.ndarray
+    light: np.ndarray
+
+    def rows(self, rows: np.ndarray) -> "_Candidates":
+        """Return some of the Gaussians."""
+        return _Candidates(
+            index=self.index[torch.from_numpy(rows).to(self.index.device)],
+            positions=self.positions[rows],
+            widths=self.widths[rows],
+            weights=self.weights[rows],
+            brightness=self.brightness[rows],
+            too_bright=self.too_bright[rows],
+            clipped=self.clipped[rows],
+            stops=None if self.stops is None else self.stops[rows],
+            doubt=self.doubt[rows],
+            angles=self.angles[:, rows],
+            light=self.light[:, rows],
+        )
+
+
+class _Shown(NamedTuple):
+    """Light that P photos receive of one light: their indices [P], solid angles [P] and light [P, 3]."""
+
+    photos: np.ndarray
+    angles: np.ndarray
+    light: np.ndarray
+
+    def without_obstructed(self, whole: np.ndarray) -> "_Shown":
+        """Return the photos that show about as much of the light's solid angles [V], `whole`, as most do."""
+        expected = whole[self.photos]
+        fractions = self.angles / np.maximum(expected, 1e-30)
+        clear = (expected > 0) & (fractions >= UNOBSTRUCTED * np.quantile(fractions, 0.9))
+        return _Shown(self.photos[clear], self.angles[clear], self.light[clear])
+
+
+def _measure_photos(field: RadianceField, views: Sequence[tuple[Camera, float]], degree: int | None) -> _Photos:
+    """Render a sample of the photos, and find the white that lights exceed."""
+    times = np.array([time for _, time in views])
+    longest = times > times.max() / 2
+    sample = [index for part in (longest, ~longest) for index in every_nth(part.nonzero()[0], MOST_VIEWS)]
+    cameras, whites = [views[index][0] for index in sample], field.response.white / times[sample]
+    received = [_received_by(field, camera, degree) for camera in cameras]
+    pixels = reduce(torch.add, (each.pixels for each in received))
+    angles = reduce(torch.add, (each.angles for each in received))
+    light = reduce(torch.add, (each.light for each in received))
+    radiance = light / angles.clamp_min(1e-20)[:, None]
+    most = field.response.white / float(np.quantile(times, 0.75, method="lower"))
+    white = _reference_white(np.minimum(whites, most), radiance.amax(1), pixels)
+    return _Photos(
+        cameras=cameras,
+        received=received,
+        white=white,
+        measurable=np.where(whites >= 2 * white, whites, 0.0),
+        focal=typical_focal_length(cameras),
+        whites=whites,
+        pixels=pixels,
+        radiance=radiance,
+    )
+
+
+def _candidates(field: RadianceField, clipped: Tensor, photos: _Photos) -> _Candidates:
+    """Return the Gaussians that are bright, that photos show, and most of whose bright values clip."""
+    peak, device = photos.radiance.amax(1), photos.radiance.device
+    too_bright = torch.zeros_like(peak)
+    for received, white in zip(photos.received, photos.whites, strict=True):
+        if white < 2 * photos.white:  # Photos of half the exposure or less measure lights, so these do not count.
+            too_bright += received.pixels * (peak > BRIGHT * white)
+    # The share is lower if the scene contradicts the other photos, which then weigh more.
+    weighted = too_bright + RESIDUAL_WEIGHT * (photos.pixels - too_bright)
+    clips = clipped.to(device) >= CLIPPED * too_bright / weighted.clamp_min(1e-20)
+    index = (clips & (photos.pixels > LEAST_SEEN) & (peak > BRIGHT * photos.white)).nonzero()[:, 0]
+    gaussians, stops = field.gaussians, field.clipped_stops
+    confidence = torch.ones_like(peak) if field.confidence is None else field.confidence.to(device)
+    return _Candidates(
+        index=index,
+        positions=field.normalization.scene_points(gaussians.means[index].cpu().numpy()),
+        widths=gaussians.log_scales[index].exp().amax(1).cpu().numpy() * field.normalization.unit,
+        weights=(photos.pixels * photos.radiance.mean(1))[index].cpu().numpy(),
+        brightness=peak[index].cpu().numpy(),
+        too_bright=(too_bright > 0)[index].cpu().numpy(),
+        clipped=clipped.to(device)[index].cpu().numpy(),
+        stops=None if stops is None else stops.to(device)[index].cpu().numpy(),
+        doubt=-confidence[index].clamp_min(2.0**-8).log2().cpu().numpy(),
+        angles=np.stack([each.angles[index].cpu().numpy() for each in photos.received]),
+        light=np.stack([each.light[index].cpu().numpy() for each in photos.received]),
+    )
+
+
+def _photos_of_whole_light(cameras: Sequence[Camera], group: _Candidates, shape: LightShape) -> _Shown:
+    """Return the photos that do not cut the light off at their border and see its face."""
+    whole = [_in_frame(camera, group.positions, group.widths, group.weights) for camera in cameras]
+    photos = np.flatnonzero(whole & (solid_angles(shape, cameras) > 0))
+    return _Shown(photos, group.angles.sum(1)[photos], group.light.sum(1)[photos])
+
+
+def _deviation(group: _Candidates, measurable: float) -> float | None:
+    """Return the deviation of a light's log2 radiance, stops, if photos measure radiance up to a value."""
+    if group.stops is None:
+        return None
+    clipped = np.maximum(group.clipped, 1e-6)
+    stops = group.stops / clipped
+    # The scene may contradict the photos that measure it.
+    misfit = np.maximum(group.doubt - group.stops, 0) / np.maximum(1 - group.clipped, 1e-6)
+    stops = np.where(group.brightness < measurable, np.minimum(stops, np.maximum(misfit, MEASURED_STOPS)), stops)
+    return float(np.average(stops, weights=group.weights * clipped))
 
 
 def _reference_white(whites: np.ndarray, radiance: Tensor, pixels: Tensor) -> float:
@@ -235,10 +339,10 @@ def _panorama(position: np.ndarray, focal: float) -> Camera:
     return Camera(2 * rows, rows, rows / np.pi, rows / np.pi, rows, rows / 2, pose, "equirectangular")
 
 
-def _view_sums(
+def _received_by(
     field: RadianceField, camera: Camera, degree: int | None, opacities: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what a camera receives of each Gaussian: pixels [N], their solid angle [N], and light times it [N, 3]."""
+) -> ReceivedLight:
+    """Return what a camera receives of each Gaussian."""
     device = field.gaussians.means.device
     angle = torch.tensor(steradians(camera), dtype=torch.float32, device=device)
     # Sums of small angles stay numbers of about 1.
@@ -246,49 +350,7 @@ def _view_sums(
     images = torch.stack([torch.ones_like(angle), angle / unit], 2)
     sums = field.weighted_sums(field.camera_tensors(camera), images, opacities)
     radiance = field.radiance_towards(camera.position, degree=degree)
-    return sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit)
-
-
-def _groups(positions: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Return the connected groups of points that are nearer to each other than `reach`, as indices."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
-    pairs = KDTree(positions).query_pairs(reach, output_type="ndarray")
-    links = coo_matrix((np.ones(len(pairs)), pairs.T), (len(positions), len(positions)))
-    count, labels = connected_components(links, directed=False)
-    return [np.flatnonzero(labels == label) for label in range(count)]
-
-
-def _shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, middle: np.ndarray) -> LightShape:
-    """Return the rectangle or sphere with the weighted mean and variances of Gaussians."""
-    weights = weights / weights.sum()
-    position = weights @ positions
-    offsets = positions - position
-    covariance = (offsets * weights[:, None]).T @ offsets
-    values, vectors = np.linalg.eigh(covariance)
-    # A Gaussian reaches beyond its center on the light's face, but not across a flat one.
-    spread = float(weights @ widths**2)
-    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1].T
-    flat = values[2] < FLATNESS * values[1]
-    if not flat:
-        diameter = 2 * float(np.sqrt(values.sum() + spread))
-        return LightShape("sphere", position, np.eye(3), (diameter, diameter))
-    normal = vectors[2] if vectors[2] @ (middle - position) >= 0 else -vectors[2]
-    axes = np.stack([vectors[0], np.cross(normal, vectors[0]), normal])
-    width, height = (float(np.sqrt(12 * (value + spread))) for value in values[:2])
-    return LightShape("rect", position, axes, (width, height))
-
-
-def _fit(shape: LightShape, received: np.ndarray, places: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the values [C] whose products with a shape's solid angles are what views at places receive [V, C].
-
-    By least squares: the radiance of light, or the area of a solid angle as a multiple of the shape's.
-    """
-    angles = np.array([shape.solid_angle(place) for place in places])
-    square = angles @ angles
-    return angles @ received / square if square > 0 else np.zeros(received.shape[1])
+    return ReceivedLight(sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit))
 
 
 def _in_frame(camera: Camera, positions: np.ndarray, widths: np.ndarray, weights: np.ndarray) -> bool:

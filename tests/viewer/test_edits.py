@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model.lights import Light, LightShape
+from sehdr_warp.model.light_shapes import LightShape
+from sehdr_warp.model.lights import Light
 from sehdr_warp.output.export.splat_edits import SplatEdits
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.scene import Camera, View

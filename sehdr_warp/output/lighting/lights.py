@@ -170,13 +170,13 @@ def lights_as_received(run: "RenderableScene", lights: Sequence[Light], center: 
     if not lights:
         return []
     focal = typical_focal_length(training_cameras(run))
-    angles, received = received_light(run.field, center.position, focal, beyond=center.beyond, degree=run.degree)
+    received = received_light(run.field, center.position, focal, beyond=center.beyond, degree=run.degree)
     result = []
     for light in lights:
-        angle, of_members = light.shape.solid_angle(center.position), angles[light.members, None]
+        angle, of_members = light.shape.solid_angle(center.position), received.angles[light.members, None]
         if angle > 0:
             # Radiance is converted, not what is received: sensor RGB is taken as white where it is above white.
-            rec709 = run.in_rec709(received[light.members] / of_members.clamp_min(1e-20))
+            rec709 = run.in_rec709(received.light[light.members] / of_members.clamp_min(1e-20))
             radiance = (rec709 * of_members).sum(0).cpu().numpy() / angle
             gain = float(radiance.mean() / max(light.radiance.mean(), 1e-30))
             radiance *= min(1.0, MOST_GAIN / max(gain, 1e-30))

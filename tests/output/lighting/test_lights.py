@@ -10,7 +10,8 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.model.lights import Light, LightShape
+from sehdr_warp.model.light_shapes import LightShape
+from sehdr_warp.model.lights import Light, ReceivedLight
 from sehdr_warp.output.commands import Lights, WorldOptions, run_lights
 from sehdr_warp.output.lighting import lights as lighting
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles, write_environment_map
@@ -44,12 +45,12 @@ def run(tmp_path, monkeypatch):
 
 
 def received(place):
-    """Solid angle [6] and light [6, 3] of the Gaussians: the first of each light gives all of its light."""
+    """What reaches a place of the Gaussians: the first of each light gives all of its light."""
     angles, light = torch.zeros(6, dtype=torch.float64), torch.zeros(6, 3, dtype=torch.float64)
     for each in LIGHTS:
         angles[each.members[0]] = each.shape.solid_angle(place)
         light[each.members[0]] = torch.from_numpy(each.radiance * each.shape.solid_angle(place))
-    return angles, light
+    return ReceivedLight(angles, angles, light)
 
 
 def test_json_has_every_figure(tmp_path, run):

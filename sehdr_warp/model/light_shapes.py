@@ -1,0 +1,86 @@
+"""Shapes of lights: the rectangle or sphere of a group of Gaussians, and the solid angles that points see of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..scene import Camera
+
+FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
+
+
+@dataclass(frozen=True, eq=False)
+class LightShape:
+    """A rectangle or a sphere, in the scene's coordinates.
+
+    Attributes:
+        kind: "rect" or "sphere".
+        position: [3] middle.
+        axes: [3, 3] rows: along the width, along the height, and the direction that a rectangle emits to.
+        size: width and height of a rectangle; the diameter of a sphere, twice.
+    """
+
+    kind: str
+    position: np.ndarray
+    axes: np.ndarray
+    size: tuple[float, float]
+
+    def solid_angle(self, point: np.ndarray) -> float:
+        """Return the solid angle that a point sees of a light; 0 from behind a rectangle, 2 pi within a sphere."""
+        towards = self.axes @ (point - self.position)
+        if self.kind == "sphere":
+            sine = min(self.size[0] / 2 / max(float(np.linalg.norm(towards)), 1e-12), 1.0)
+            return float(2 * np.pi * sine**2 / (1 + np.sqrt(1 - sine**2)))
+        if towards[2] <= 0:
+            return 0.0
+        u, v = (towards[i] + np.array([0.5, -0.5]) * self.size[i] for i in (0, 1))
+        corners = np.arctan2(np.outer(u, v), towards[2] * np.sqrt(u[:, None] ** 2 + v**2 + towards[2] ** 2))
+        return float(corners[0, 0] - corners[0, 1] - corners[1, 0] + corners[1, 1])
+
+
+def solid_angles(shape: LightShape, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the solid angles [V] that cameras see of a light."""
+    return np.array([shape.solid_angle(camera.position) for camera in cameras])
+
+
+def connected_groups(positions: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Return the connected groups of points that are nearer to each other than `reach`, as indices."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(positions).query_pairs(reach, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), pairs.T), (len(positions), len(positions)))
+    count, labels = connected_components(links, directed=False)
+    return [np.flatnonzero(labels == label) for label in range(count)]
+
+
+def fitted_shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, middle: np.ndarray) -> LightShape:
+    """Return the rectangle or sphere with the weighted mean and variances of Gaussians."""
+    weights = weights / weights.sum()
+    position = weights @ positions
+    offsets = positions - position
+    covariance = (offsets * weights[:, None]).T @ offsets
+    values, vectors = np.linalg.eigh(covariance)
+    # A Gaussian reaches beyond its center on the light's face, but not across a flat one.
+    spread = float(weights @ widths**2)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1].T
+    flat = values[2] < FLATNESS * values[1]
+    if not flat:
+        diameter = 2 * float(np.sqrt(values.sum() + spread))
+        return LightShape("sphere", position, np.eye(3), (diameter, diameter))
+    normal = vectors[2] if vectors[2] @ (middle - position) >= 0 else -vectors[2]
+    axes = np.stack([vectors[0], np.cross(normal, vectors[0]), normal])
+    width, height = (float(np.sqrt(12 * (value + spread))) for value in values[:2])
+    return LightShape("rect", position, axes, (width, height))
+
+
+def fit_solid_angles(shape: LightShape, received: np.ndarray, places: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the values [C] whose products with a shape's solid angles are what views at places receive [V, C].
+
+    By least squares: the radiance of light, or the area of a solid angle as a multiple of the shape's.
+    """
+    angles = np.array([shape.solid_angle(place) for place in places])
+    square = angles @ angles
+    return angles @ received / square if square > 0 else np.zeros(received.shape[1])
