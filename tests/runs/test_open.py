@@ -218,21 +218,23 @@ def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_th
 
 
 def test_the_castle_goes_on_if_its_cameras_are_found_again(tmp_path, shared, monkeypatch):
-    """Structure from motion runs twice, with another seed."""
-    photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
+    """Structure from motion runs twice, with another seed.
+
+    All photos, because fewer do not fix the focal length: of five, it differs by up to 2.4 % between seeds.
+    """
     (tmp_path / "photos").mkdir()
-    for photo in photos:
+    for photo in (shared / "data" / "castle").glob("*.JPG"):
         with Image.open(photo) as image:
-            image.reduce(4).save(tmp_path / "photos" / photo.name, exif=image.getexif(), quality=95)
+            image.reduce(6).save(tmp_path / "photos" / photo.name, exif=image.getexif(), quality=95)
     run, options = tmp_path / "run", ["--device", "cpu", "--iterations"]
     monkeypatch.setenv("SEHDR_CACHE", str(tmp_path / "first"))
-    assert call("train", tmp_path / "photos", "--out", run, *TRAIN.replace("40", "100").split(), *options[2:], 30) == 0
+    assert call("train", tmp_path / "photos", "--out", run, *TRAIN.split(), *options[2:], 4) == 0
     without_lenses(run)
     monkeypatch.setenv("SEHDR_CACHE", str(tmp_path / "second"))
     monkeypatch.setattr(reconstruction, "SEED", reconstruction.SEED + 1)
-    assert call("train", "--resume", "--out", run, *options, 60) == 0
-    assert load_run(run).iterations == 60
-    scene, saved = load_scene(tmp_path / "photos", max_size=100, response="srgb"), RunFolder(run).read_cameras()
+    assert call("train", "--resume", "--out", run, *options, 8) == 0
+    assert load_run(run).iterations == 8
+    scene, saved = load_scene(tmp_path / "photos", max_size=40, response="srgb"), RunFolder(run).read_cameras()
     found, known = ([each.camera.world_to_camera for each in views] for views in (scene.views, saved))
     assert not np.array_equal(found, known)
     trainer = create_trainer(scene, run, resume=True, device="cpu")
