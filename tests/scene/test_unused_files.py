@@ -70,9 +70,9 @@ def test_frames_without_photos_are_left_out_and_named(tmp_path):
     scene = load(tmp_path)
     assert len(scene.views) == 6
     assert "3 of 9 frames have no photo and were left out: ./images/r_1, ./images/r_4, ./images/r_8" in scene.notes
-    for file in (tmp_path / "images").iterdir():
-        file.unlink()
-    with pytest.raises(InputError, match="image file not found, nor any of 9 frames"):
+    (tmp_path / "images").rename(tmp_path / "My Photos")
+    remedy = "photos of these names are in My Photos: rename it to images"
+    with pytest.raises(InputError, match=f"image file not found, nor any of 9 frames; {remedy}"):
         load(tmp_path)
 
 

@@ -64,8 +64,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
     """
     places = (place for place in (folder, folder / "images", folder / INPUT) if place.is_dir())
     candidates = [list_images(place, PHOTO_SUFFIXES) for place in places]
-    # A single picture beside `images/` is a cover.
-    photos = next((each for each in candidates if len(each) > 1), next(filter(None, candidates), []))
+    photos = max(candidates, key=len)  # Fewer pictures beside `images/` are a cover, or pictures of results.
     together = _folders_of_a_camera(folder) if not photos else []
     photos = photos or [photo for place in together for photo in list_images(folder / place, PHOTO_SUFFIXES)]
     if not photos:
@@ -90,6 +89,11 @@ def find_photos(folder: Path) -> DataparserOutputs:
     for place in ("sparse/0", "sparse"):
         if not model and any((folder / place / f"images{end}").is_file() for end in (".bin", ".txt")):
             notes.append(f"{place} is not read, because it has no cameras.bin or cameras.txt: cameras are found anew")
+    if photos[0].parent != folder and len(candidates[0]) > 1:
+        count = f"{len(candidates[0])} photos beside {photos[0].parent.name}"
+        notes.append(
+            f"{count} are not read, because there are more in it: {first_names([p.name for p in candidates[0]])}"
+        )
     if photos[0].parent == folder and (inner := _folders_with_photos(folder)):
         notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
     stems = Counter(fold_name(photo.stem) for photo in photos) if together else {}

@@ -55,7 +55,8 @@ def read_opensfm(folder: Path) -> DataparserOutputs:
         if lens is None:
             raise InputError(path, f"shot {name!r:.90} has no camera of the file", _REMEDY)
         try:
-            records.append(ImageRecord(image.stem, image, lens, _pose(shots[name], path, name), oriented=True))
+            # OpenSfM reads pixels as they are stored, whatever their EXIF orientation says.
+            records.append(ImageRecord(image.stem, image, lens, _pose(shots[name], path, name)))
         except InputError as error:
             unusable.append(error)
     notes = unusable_notes(unusable, len(records) + len(unusable))

@@ -141,7 +141,10 @@ class _Frames:
         notes = unusable_notes(self.unusable, count + len(self.absent) + len(self.unusable))
         if not count:
             problem = f"image file not found, nor any of {len(self.absent)} frames"
-            raise InputError(folder / plain_path(self.absent[0]), problem, INCOMPLETE)
+            images = find_images(folder, self.absent, folder)
+            place = next((image.parent.relative_to(folder) for image in images.values() if image), None)
+            remedy = INCOMPLETE if place is None else f"photos of these names are in {place}: rename it to images"
+            raise InputError(folder / plain_path(self.absent[0]), problem, remedy)
         notes += [*absent_note(self.absent, count), *renamed_note(self.photos)]
         if 2 * len(self.untimed) > count:
             raise self.untimed[0]

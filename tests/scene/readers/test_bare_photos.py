@@ -120,6 +120,16 @@ def test_photos_as_3dgs_convert_expects_them(tmp_path):
     assert [record.image.parent.name for record in find_photos(tmp_path).records] == ["input"] * 4
 
 
+def test_fewer_pictures_of_results_lie_beside_the_photos(tmp_path):
+    photos(tmp_path / "images", 5)
+    for i in range(3):
+        Image.fromarray(pattern(16, 12, 10 + i)).save(tmp_path / f"mesh{i}.jpg")
+    dataset = find_photos(tmp_path)
+    assert [record.image.parent.name for record in dataset.records] == ["images"] * 5
+    beside = "3 photos beside images are not read, because there are more in it: mesh0.jpg, mesh1.jpg, mesh2.jpg"
+    assert beside in dataset.notes
+
+
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
     ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"), ("frame_00000.json", "3D Scanner App"),

@@ -70,6 +70,18 @@ def test_what_cannot_be_used_is_named(tmp_path):
     refused("shot '1.jpg' has no camera", json.dumps(whole))
 
 
+def test_pixels_count_as_they_are_stored(tmp_path):
+    """OpenSfM ignores the EXIF orientation, with which phones mark portrait photos."""
+    folder = write(tmp_path, "perspective")
+    for photo in sorted((folder / "images").iterdir()):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        with Image.open(photo) as image:
+            image.save(photo, exif=exif)
+    camera = load_scene(folder, response="srgb").views[0].camera
+    assert (camera.width, camera.height) == (48, 36)
+
+
 @pytest.mark.parametrize("images", ["images", "opensfm/images"])
 def test_projects_of_opendronemap(tmp_path, images):
     """OpenSplat issue 126: the reconstruction lies in opensfm/, the photos beside it or in it, in other letters."""
