@@ -77,6 +77,8 @@ FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".av
 """FFmpeg's formats by suffix: those of one file. Others write further files beside it, whoever owns their names."""
 _SLOWEST, _FASTEST = 0.1, 1000.0
 """Frames a second."""
+_NTSC = 1e-4  # Relative difference up to which a rate is a whole one over 1.001, as of television
+_SQUARE = 0.005  # Difference of width and height up to which a calibrated camera's pixels are meant to be square
 
 
 def write_film(
@@ -118,6 +120,7 @@ def write_film(
     check_rate(fps)
     # Chroma of 4:2:0 covers two by two pixels.
     width, height = (max(2, side - side % 2) for side in (first.width, first.height))
+    aspect = first.fy / first.fx if first.is_pinhole else 1.0  # Width of a pixel over its height
     gain = run.base_time * display_gain(run.response)
     stops = np.linspace(*ev_ramp, len(cameras))
     mapped = transfer == "sdr" and not exposed and ev_ramp[0] == ev_ramp[1]
@@ -129,6 +132,8 @@ def write_film(
             name = f"file:{temporary.absolute()}"
             with av.open(name, "w", format=container_format, options=options) as container:
                 stream = _add_stream(container, kind, fps, width, height)
+                if abs(aspect - 1) > _SQUARE:
+                    stream.codec_context.sample_aspect_ratio = Fraction(aspect).limit_denominator(100)
                 for camera, ev in zip(_with_progress(cameras, out, tell), stops):
                     hdr = as_array(run.render(camera.resized(width, height)).hdr) * np.float32(2.0**ev)
                     encoded = tone_map(hdr) if tone_map else encode(hdr * np.float32(gain), transfer)
@@ -144,7 +149,7 @@ def write_film(
 
 def _add_stream(container: Any, kind: Transfer, fps: float, width: int, height: int) -> Any:
     """Add the video stream of a film to a container of PyAV, and return it."""
-    stream = container.add_stream(kind.codec, rate=Fraction(fps).limit_denominator(1001))
+    stream = container.add_stream(kind.codec, rate=_frame_rate(fps))
     stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
     stream.options = kind.options
     if kind.codec == "libx265" and min(width, height) < _X265_SMALLEST_SIDE:
@@ -155,6 +160,14 @@ def _add_stream(container: Any, kind: Transfer, fps: float, width: int, height: 
     context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
     context.color_range = 1
     return stream
+
+
+def _frame_rate(fps: float) -> Fraction:
+    """Return frames a second as a fraction: of 23.976, 29.97 and the like, whole rates over 1.001."""
+    whole = round(fps * 1.001)
+    if fps != round(fps) and abs(whole / 1.001 - fps) < _NTSC * fps:
+        return Fraction(whole * 1000, 1001)
+    return Fraction(fps).limit_denominator(1001)
 
 
 def film_format(out: Path | str) -> str:
@@ -186,22 +199,17 @@ def encode(light: np.ndarray, transfer: str) -> np.ndarray:
     """
     if transfer == "sdr":
         return encode_srgb(light)
-    if transfer in LOG_CURVES:
-        import colour
+    import colour
 
+    if transfer in LOG_CURVES:
         curve, primaries = LOG_CURVES[transfer]
         linear = np.maximum(np.asarray(light, np.float64) @ matrix_to(primaries).T, 1e-10)
         return np.clip(colour.log_encoding(linear, curve), 0, 1)
-    wide = np.maximum(np.asarray(light, np.float64) @ matrix_to(color_space("rec2020").dataset).T, 0) * REFERENCE_WHITE
-    luminances = np.minimum(wide, PEAK)
+    white = np.asarray(light, np.float64) @ matrix_to(color_space("rec2020").dataset).T
+    luminances = np.clip(REFERENCE_WHITE * white, 1e-9, PEAK)  # The curves divide by them.
     if transfer == "hdr10":
-        powered = (luminances / 10000) ** 0.1593017578125
-        return ((0.8359375 + 18.8515625 * powered) / (1 + 18.6875 * powered)) ** 78.84375
-    luminance = (luminances / PEAK) @ np.array([0.2627, 0.6780, 0.0593])
-    scene = luminances / PEAK * np.maximum(luminance, 1e-12)[..., None] ** (1 / 1.2 - 1)
-    scene = np.clip(scene, 0, 1)
-    high = 0.17883277 * np.log(np.maximum(12 * scene - 0.28466892, 1e-9)) + 0.55991073
-    return np.where(scene <= 1 / 12, np.sqrt(3 * scene), high)
+        return colour.models.eotf_inverse_ST2084(luminances)
+    return np.clip(colour.models.eotf_inverse_BT2100_HLG(luminances, L_B=0, L_W=PEAK, gamma=1.2), 0, 1)
 
 
 def _frame(av: Any, encoded: np.ndarray, kind: Transfer) -> Any:

@@ -4,6 +4,8 @@ import ctypes
 import os
 import subprocess
 import sys
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +72,20 @@ def test_a_film_holds_the_light_and_says_how(tmp_path, transfer, codec, tags):
         assert encode(np.ones(3), "hdr10") == pytest.approx(0.581, abs=2e-3) and decoded.max() > 0.65
 
 
+@pytest.mark.parametrize("name, transfer", [("f.mp4", "sdr"), ("f.mov", "logc3")])
+def test_a_film_states_the_shape_of_its_pixels_and_rates_of_television(tmp_path, name, transfer):
+    """Anamorphic cameras have pixels twice as wide as high; 23.976 stands for 24000 frames in 1001 seconds."""
+    run, cameras = smooth_run()
+    wide = [replace(camera, fx=camera.fy / 2) for camera in cameras]
+    write_film(run, tmp_path / name, wide, transfer=transfer, fps=23.976)
+    square = [replace(camera, fx=1.001 * camera.fy) for camera in cameras]
+    write_film(run, tmp_path / f"square-{name}", square, transfer=transfer, fps=12.5)
+    for file, aspect, rate in ((name, 2, Fraction(24000, 1001)), (f"square-{name}", None, Fraction(25, 2))):
+        with av.open(str(tmp_path / file)) as container:
+            stream = container.streams.video[0]
+            assert (stream.sample_aspect_ratio, stream.average_rate) == (aspect, rate)
+
+
 def test_references_of_the_curves():
     # ITU-R BT.2408: diffuse white of 203 cd/m2 is 58 % PQ and 75 % HLG; 1000 cd/m2 is 75 % PQ and 100 % HLG.
     assert encode(np.full(3, 1.0), "hlg") == pytest.approx(0.75, abs=3e-3)
@@ -79,7 +95,7 @@ def test_references_of_the_curves():
     for transfer, code in (("logc3", 400), ("slog3", 420), ("acescct", 423)):
         np.testing.assert_allclose(encode(np.full(3, 0.18), transfer) * 1023, code, atol=0.6)
         assert encode(np.full(3, 30.0), transfer).max() < 1 and (encode(np.zeros(3), transfer) >= 0).all()
-    assert encode(np.zeros(3), "hlg") == pytest.approx(0) and encode(np.zeros(3), "hdr10") == pytest.approx(0, abs=1e-5)
+    assert encode(np.zeros(3), "hlg") == pytest.approx(0, abs=1e-5) and encode(np.zeros(3), "hdr10") == pytest.approx(0, abs=1e-5)
 
 
 def test_a_ramp_runs_through_the_stops(tmp_path):
