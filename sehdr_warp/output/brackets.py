@@ -117,10 +117,11 @@ def write_brackets(
         overwrite: Replace the files that an earlier call wrote.
 
     Raises:
-        SehdrError: For unusable exposures or options.
+        SehdrError: For unusable exposures or self.
         InputError: If a file would be replaced or a pixel is not finite.
     """
-    brackets = Brackets(
+    writer = BracketWriter(
+        out=Path(out),
         exposures=bracket_exposures(base_time, evs=evs, exposures=exposures),
         header=PictureHeader(base_time, colorspace),
         pixel=pixel,
@@ -130,11 +131,11 @@ def write_brackets(
         group_by=group_by,
     )
     radiances = dict(views)
-    with brackets.open(Path(out), overwrite) as writer:
+    with writer.open(overwrite):
         for file_name, (name, radiance) in zip(safe_names(list(radiances)), radiances.items(), strict=True):
             writer.write(file_name, radiance, (cameras or {}).get(name))
     if overwrite and ldr is None:
-        remove_earlier(Path(out), ["brackets_ldr"])
+        remove_earlier(writer.out, ["brackets_ldr"])
     return writer.files()
 
 
@@ -151,11 +152,12 @@ def remove_earlier(out: Path, names: Iterable[str]) -> None:
             log.warning("%s: stays, though this call did not write it: it is yours, or was changed", path)
 
 
-@dataclass(frozen=True)
-class Brackets:
-    """Options of exposure brackets, checked when they are set.
+@dataclass
+class BracketWriter:
+    """Writes the brackets of views one at a time, within open().
 
     Attributes:
+        out: Folder that the files belong to.
         exposures: Ascending, as from bracket_exposures.
         header: EXR attributes of the pictures.
         pixel: "half" (float if half would overflow) or "float".
@@ -163,8 +165,10 @@ class Brackets:
         ldr: One of LDR_FORMATS to add simulated photos through response.encode, or None.
         response: Camera response for ldr.
         group_by: "view" or "exposure": what one folder holds. Folders by exposure hold image sequences.
+        views: Entries of the manifest so far.
     """
 
+    out: Path
     exposures: tuple[Exposure, ...]
     header: PictureHeader
     pixel: str = "half"
@@ -172,6 +176,7 @@ class Brackets:
     ldr: str | None = None
     response: Any = None
     group_by: str = "view"
+    views: list[dict] = field(default_factory=list)
 
     def __post_init__(self):
         """Raise SehdrError for options that contradict each other."""
@@ -186,20 +191,17 @@ class Brackets:
             raise SehdrError("LDR brackets need a camera response; pass response, or leave out ldr")
 
     @contextmanager
-    def open(self, out: Path, overwrite: bool = False) -> Iterator["BracketWriter"]:
-        """Open a writer of brackets; its files appear together when the context ends without an error.
+    def open(self, overwrite: bool = False) -> Iterator[None]:
+        """Let write() be called; the files appear together when the context ends without an error.
 
-        Args:
-            out: Folder for the files.
-            overwrite: Replace folders that an earlier call wrote.
+        overwrite: Replace folders that an earlier call wrote.
         """
         with (
-            atomic_path(out / "brackets.json", overwrite) as manifest,
-            atomic_folder(out / "brackets", overwrite) as folder,
-            atomic_folder(out / "brackets_ldr", overwrite) if self.ldr else nullcontext(out) as photos,
+            atomic_path(self.out / "brackets.json", overwrite) as manifest,
+            atomic_folder(self.out / "brackets", overwrite) as self._folder,
+            atomic_folder(self.out / "brackets_ldr", overwrite) if self.ldr else nullcontext(self.out) as self._photos,
         ):
-            writer = BracketWriter(self, out, folder, photos)
-            yield writer
+            yield
             described = {
                 "format": MANIFEST_FORMAT,
                 "software": "sehdr-warp",
@@ -210,28 +212,9 @@ class Brackets:
                 "response": getattr(self.response, "name", None),
                 "ldr": self.ldr,
                 "provenance": dict(self.header.provenance),
-                "views": writer.views,
+                "views": self.views,
             }
             write_json(manifest, described)
-
-
-@dataclass(frozen=True)
-class BracketWriter:
-    """Writes the brackets of views one at a time; from Brackets.open().
-
-    Attributes:
-        brackets: Options.
-        out: Folder that the files belong to.
-        folder: Where EXR files are written until all are complete.
-        photos: The same for simulated photos; not used without them.
-        views: Entries of the manifest so far.
-    """
-
-    brackets: Brackets
-    out: Path
-    folder: Path
-    photos: Path
-    views: list[dict] = field(default_factory=list)
 
     def files(self) -> list[Path]:
         """Return the paths of the EXR files and of the photos beside them."""
@@ -244,39 +227,38 @@ class BracketWriter:
 
         Simulated photos encode this radiance, so that merging them by the response gives it back.
         """
-        options = self.brackets
         radiance = np.asarray(radiance, np.float64)
         if radiance.shape[2:] != (3,):
             raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
         check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
-        linear = from_rec709(radiance, options.header.colorspace)
-        pixels = [linear * exposure.time for exposure in options.exposures]
+        linear = from_rec709(radiance, self.header.colorspace)
+        pixels = [linear * exposure.time for exposure in self.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
-        pixel = stored_pixel_type(pixels, options.pixel)
+        pixel = stored_pixel_type(pixels, self.pixel)
         # write_multipart_exr() sees one exposure, so it cannot tell why the type is another one.
-        reason = {"sehdr:pixelType": PAST_HALF} if pixel != options.pixel else {}
+        reason = {"sehdr:pixelType": PAST_HALF} if pixel != self.pixel else {}
         if reason:
             log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)
         parts, entries = [], []
         digits = len(str(len(pixels) - 1))  # Tools sort files by name.
-        for index, (exposure, image) in enumerate(zip(options.exposures, pixels, strict=True)):
+        for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
             label = f"b{index:0{digits}d}_{exposure.label}"
-            header = options.header.attributes(exposure.time, camera, view=name, ev=repr(exposure.ev)) | reason
-            parts.append(Part(rgb_channels(image), header, label if options.multipart else ""))
-            place = f"{name}/{name}_{label}" if options.group_by == "view" else f"{label}/{name}"
-            file = f"{name}.exr" if options.multipart else f"{place}.exr"
+            header = self.header.attributes(exposure.time, camera, view=name, ev=repr(exposure.ev)) | reason
+            parts.append(Part(rgb_channels(image), header, label if self.multipart else ""))
+            place = f"{name}/{name}_{label}" if self.group_by == "view" else f"{label}/{name}"
+            file = f"{name}.exr" if self.multipart else f"{place}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
-            if options.multipart:
+            if self.multipart:
                 entry["part"] = index
             else:
-                write_multipart_exr(self.folder / file, parts[-1:], pixel=pixel)
-            if options.ldr:
-                photo = f"{place}.{'jpg' if options.ldr == 'jpeg' else 'png'}"
-                exif = exposure_exif(exposure.time, bias=exposure.ev, captured=options.header.captured)
-                codes = quantize(options.response.encode(radiance * exposure.time), 16 if options.ldr == "png16" else 8)
-                write_picture(self.photos / photo, codes, exif=exif)
+                write_multipart_exr(self._folder / file, parts[-1:], pixel=pixel)
+            if self.ldr:
+                photo = f"{place}.{'jpg' if self.ldr == 'jpeg' else 'png'}"
+                exif = exposure_exif(exposure.time, bias=exposure.ev, captured=self.header.captured)
+                codes = quantize(self.response.encode(radiance * exposure.time), 16 if self.ldr == "png16" else 8)
+                write_picture(self._photos / photo, codes, exif=exif)
                 entry["ldr_file"] = f"brackets_ldr/{photo}"
             entries.append(entry)
-        if options.multipart:
-            write_multipart_exr(self.folder / f"{name}.exr", parts, pixel=pixel)
+        if self.multipart:
+            write_multipart_exr(self._folder / f"{name}.exr", parts, pixel=pixel)
         self.views.append({"view": name, "pixel": pixel, "exposures": entries})

@@ -206,10 +206,11 @@ def encode(light: np.ndarray, transfer: str) -> np.ndarray:
         linear = np.maximum(np.asarray(light, np.float64) @ matrix_to(primaries).T, 1e-10)
         return np.clip(colour.log_encoding(linear, curve), 0, 1)
     white = np.asarray(light, np.float64) @ matrix_to(color_space("rec2020").dataset).T
-    luminances = np.clip(REFERENCE_WHITE * white, 1e-9, PEAK)  # The curves divide by them.
+    luminances = np.clip(REFERENCE_WHITE * white, 1e-12, PEAK)  # The curves divide by them.
     if transfer == "hdr10":
         return colour.models.eotf_inverse_ST2084(luminances)
-    return np.clip(colour.models.eotf_inverse_BT2100_HLG(luminances, L_B=0, L_W=PEAK, gamma=1.2), 0, 1)
+    with np.errstate(invalid="ignore"):  # In the half of the curve that is not used.
+        return np.clip(colour.models.eotf_inverse_BT2100_HLG(luminances, L_B=0, L_W=PEAK, gamma=1.2), 0, 1)
 
 
 def _frame(av: Any, encoded: np.ndarray, kind: Transfer) -> Any:

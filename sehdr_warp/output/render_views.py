@@ -15,7 +15,7 @@ from ..progress import track_progress
 from ..scene import Camera
 from ..scene.exposure.times import shutter
 from ..subsets import evenly, first_names
-from .brackets import Brackets, bracket_exposures, remove_earlier
+from .brackets import BracketWriter, bracket_exposures, remove_earlier
 from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .cameras.selection import check_cameras, may_move, read_size, select_cameras
 from .images.colorspace import from_rec709
@@ -119,7 +119,8 @@ def render_views(
     hdr_exposure = exposure_of_white(run, reference_white)
     brackets = None
     if has_brackets:
-        brackets = Brackets(
+        brackets = BracketWriter(
+            out=out,
             exposures=bracket_exposures(run.base_time, evs=evs, exposures=exposures),
             header=header,
             pixel=pixel,
@@ -143,19 +144,20 @@ def render_views(
             stack.enter_context(atomic_path(out / name, overwrite)).write_text(text, encoding="utf-8")
         hdr_folder = stack.enter_context(atomic_folder(out / "hdr", overwrite))
         preview_folder = stack.enter_context(atomic_folder(out / "preview", overwrite))
-        bracket_writer = stack.enter_context(brackets.open(out, overwrite)) if brackets else None
+        if brackets is not None:
+            stack.enter_context(brackets.open(overwrite))
         to_display = to_display or shared_tone_map(run, [each for _, each in views])
         for index, (name, view_camera) in track_progress("rendering views", views, log):
-            images = render_images(run, view_camera, transform)
+            images = render_images(run, view_camera, transform, aov_names)
             if images.confidence is None and index == 0:
                 log.info("without a confidence channel; for a run, `sehdr-warp report` measures it, from the photos")
-            attributes = header.attributes(hdr_exposure, images.camera_in_file, view=name)
+            attributes = header.attributes(hdr_exposure, images.camera, view=name)
             parts = _hdr_parts(images, attributes, colorspace, hdr_exposure, aov_names)
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
             write_picture(preview_folder / f"{name}.png", quantize(to_display(images.hdr)))
-            if bracket_writer is not None:
-                bracket_writer.write(name, images.hdr, images.camera_in_file)
+            if brackets is not None:
+                brackets.write(name, images.hdr, images.camera)
             if images.alpha.mean() < _LEAST_ALPHA:
                 empty.append(name)
     if empty:
@@ -163,8 +165,8 @@ def render_views(
         problem = "see nothing of the scene, or next to nothing: are they in its coordinates, and do they look at it?"
         log.warning("%d of %d cameras (%s) %s", len(empty), len(views), names, problem)
     files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
-    if bracket_writer is not None:
-        files += [*bracket_writer.files(), out / "brackets.json"]
+    if brackets is not None:
+        files += [*brackets.files(), out / "brackets.json"]
     files += [out / name for name in camera_files]
     if overwrite:
         written = {file.relative_to(out).parts[0] for file in files}

@@ -25,40 +25,51 @@ class ViewImages:
     """A rendered view on the CPU.
 
     Attributes:
-        run: Scene that it shows.
-        camera: In the scene's coordinates.
-        camera_in_file: The same camera in the coordinates of the file.
+        camera: In the coordinates of the file.
         hdr: [H, W, 3] linear Rec.709 radiance.
         alpha: [H, W] coverage.
         depth: [H, W] in the file's units, along the camera's axis, of a wide camera the distance; 0 where nothing is.
         confidence: [H, W] in [0, 1]; None if it was not measured.
+        clipped: [H, W] share of the light that photos clip; None if no AOV asks for it.
     """
 
-    run: "RenderableScene"
     camera: Camera
-    camera_in_file: Camera
     hdr: np.ndarray
     alpha: np.ndarray
     depth: np.ndarray
     confidence: np.ndarray | None
+    clipped: np.ndarray | None
 
 
-def render_images(run: "RenderableScene", camera: Camera, transform: WorldTransform) -> ViewImages:
-    """Render a view from a camera in the scene's coordinates; `transform` leads to those of the file."""
-    view, confidence = run.render(camera), run.render_confidence(camera)
-    confidence = None if confidence is None else as_array(confidence)
+def render_images(
+    run: "RenderableScene", camera: Camera, transform: WorldTransform, aovs: Sequence[str] = ()
+) -> ViewImages:
+    """Render a view from a camera in the scene's coordinates; `transform` leads to those of the file.
+
+    Raises SehdrError if one of the AOVs was not measured for the run.
+    """
+    view = run.render(camera)
+    measured = {
+        "confidence": run.render_confidence(camera),
+        "clipped": run.render_clipped(camera) if "clipped" in aovs else None,
+    }
+    for name, values in measured.items():
+        if values is None and name in aovs:
+            remedy = "`sehdr-warp report` measures it for a run, from the photos; else leave the AOV out"
+            raise SehdrError(f"{run.path}: AOV {name} was not measured; {remedy}")
     hdr, alpha, depth = (as_array(values) for values in (view.hdr, view.alpha, view.depth))
     depth = depth * np.float32(transform.scale)
-    return ViewImages(run, camera, transform.camera(camera), hdr, alpha, depth, confidence)
+    measured = {name: None if values is None else as_array(values) for name, values in measured.items()}
+    return ViewImages(transform.camera(camera), hdr, alpha, depth, **measured)
 
 
-Channels = Mapping[str, np.ndarray]
+Channels = Mapping[str, Any]
 
 
 def _depth(view: ViewImages) -> Channels:
     """Return Z and the distance from the camera; 0 where nothing is."""
     depth = view.depth
-    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(view.camera_in_file), axis=2)}
+    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(view.camera), axis=2)}
 
 
 def _position(view: ViewImages) -> Channels:
@@ -71,7 +82,7 @@ def _normals(view: ViewImages) -> Channels:
     points = _points(view)
     down, right = (np.gradient(points, axis=axis) if points.shape[axis] > 1 else 0 * points for axis in (0, 1))
     normal = np.cross(down, right)
-    normal *= np.where((normal * (view.camera_in_file.position - points)).sum(2, keepdims=True) < 0, -1, 1)
+    normal *= np.where((normal * (view.camera.position - points)).sum(2, keepdims=True) < 0, -1, 1)
     length = np.linalg.norm(normal, axis=2, keepdims=True)
     # A difference with an empty pixel has no meaning.
     covered = view.depth > 0
@@ -81,33 +92,13 @@ def _normals(view: ViewImages) -> Channels:
     return {f"N.{axis}": normal[..., i] for i, axis in enumerate("XYZ")}
 
 
-def _alpha(view: ViewImages) -> Channels:
-    return {"A": view.alpha}
-
-
-def _confidence(view: ViewImages) -> Channels:
-    return {"confidence": _require_values(view, "confidence", view.confidence)}
-
-
-def _clipped(view: ViewImages) -> Channels:
-    return {"clipped": _require_values(view, "clipped", view.run.render_clipped(view.camera))}
-
-
-def _require_values(view: ViewImages, name: str, values: Any) -> np.ndarray:
-    """Return the values of an AOV as an array; raise SehdrError if they were not measured."""
-    if values is None:
-        remedy = "`sehdr-warp report` measures it for a run, from the photos; else leave the AOV out"
-        raise SehdrError(f"{view.run.path}: AOV {name} was not measured; {remedy}")
-    return as_array(values)
-
-
 AOVS: Mapping[str, Callable[[ViewImages], Channels]] = {
     "depth": _depth,
     "position": _position,
     "normals": _normals,
-    "alpha": _alpha,
-    "confidence": _confidence,
-    "clipped": _clipped,
+    "alpha": lambda view: {"A": view.alpha},
+    "confidence": lambda view: {"confidence": view.confidence},
+    "clipped": lambda view: {"clipped": view.clipped},
 }
 
 
@@ -144,6 +135,6 @@ def _rays(camera: Camera) -> np.ndarray:
 
 def _points(view: ViewImages) -> np.ndarray:
     """Return [H, W, 3] coordinates of the visible surface in the file; 0 where nothing is."""
-    camera, depth = view.camera_in_file, view.depth[..., None]
+    camera, depth = view.camera, view.depth[..., None]
     points = (_rays(camera) * depth) @ camera.world_to_camera[:3, :3] + camera.position
     return np.where(depth > 0, points, 0)

@@ -124,7 +124,11 @@ def read_gaussians(path: Path | str) -> GaussianArrays:
     Raises:
         InputError: If the file is missing, damaged, of another kind or holds no Gaussian.
     """
-    return FORMATS[check_suffix(path)].read(Path(path)).checked(path)
+    gaussians = FORMATS[check_suffix(path)].read(Path(path)).checked(path)
+    if gaussians.antialiased:
+        text = "%s: states opacity compensation, and is rendered with it; without it small Gaussians are brighter"
+        log.info(text, path)
+    return gaussians
 
 
 def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: bool = False) -> None:

@@ -3,7 +3,8 @@
 import json
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -195,13 +196,6 @@ class GaussianArrays:
 _ARRAYS = tuple(field.name for field in fields(GaussianArrays))[:5]
 
 
-def log_compensation(path: Path, antialiased: bool, statement: str) -> None:
-    """Log that a file states opacity compensation."""
-    if antialiased:
-        text = "%s: states opacity compensation (%s), and is rendered with it; without it small Gaussians are brighter"
-        log.info(text, path, statement)
-
-
 def join_gaussians(parts: Sequence[GaussianArrays]) -> GaussianArrays:
     """Return several sets of Gaussians in one space, of one color model and exposure, as one of the largest degree."""
     degree = max(part.degree for part in parts)
@@ -235,32 +229,41 @@ def degree_of(coefficients: float, path: Path) -> int:
     return degree
 
 
-def read_focals(value: Any, path: Path) -> tuple[float, float] | None:
-    """Return stored photo_focals, which may be JSON text or numbers; None for None.
+def stated_facts(gaussians: GaussianArrays) -> dict[str, Any]:
+    """Return what files state of Gaussians beside their arrays, as plain values; without what is not known."""
+    facts: dict[str, Any] = {"base_exposure_time": gaussians.base_time}
+    if gaussians.photo_focals is not None:
+        facts["photo_focals"] = list(gaussians.photo_focals)
+    if gaussians.world_matrix is not None:
+        facts["world_matrix"] = gaussians.world_matrix.tolist()
+    return facts
+
+
+def read_facts(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Return arguments of GaussianArrays by what stated_facts() returned; values may be text, lists JSON.
 
     Raises:
-        InputError: If they are not two positive numbers, the smaller one first.
+        InputError: If focal lengths are not two positive numbers in order, or the matrix is not a similarity.
     """
-    if value is None:
-        return None
-    try:
-        low, high = map(float, json.loads(value) if isinstance(value, str) else value)
-    except (TypeError, ValueError, RecursionError):
-        low, high = math.nan, math.nan
-    if not 0 < low <= high < math.inf:
-        problem = f"its focal lengths of the photos are {value!s:.60}, not two positive numbers in order"
-        raise InputError(path, problem, "export it again")
-    return low, high
+    result: dict[str, Any] = {"base_time": math.nan}  # GaussianArrays.checked() refuses it.
+    with suppress(TypeError, ValueError):
+        result["base_time"] = float(facts.get("base_exposure_time", 1.0))
+    if (focals := facts.get("photo_focals")) is not None:
+        try:
+            low, high = map(float, json.loads(focals) if isinstance(focals, str) else focals)
+        except (TypeError, ValueError, RecursionError):
+            low, high = math.nan, math.nan
+        if not 0 < low <= high < math.inf:
+            problem = f"its focal lengths of the photos are {focals!s:.60}, not two positive numbers in order"
+            raise InputError(path, problem, "export it again")
+        result["photo_focals"] = low, high
+    if (matrix := facts.get("world_matrix")) is not None:
+        result["world_matrix"] = _similarity(matrix, path)
+    return result
 
 
-def read_matrix(value: Any, path: Path) -> np.ndarray | None:
-    """Return a stored world_matrix, which may be JSON text or nested numbers; None for None.
-
-    Raises:
-        InputError: If it is not a similarity.
-    """
-    if value is None:
-        return None
+def _similarity(value: Any, path: Path) -> np.ndarray:
+    """Return a stored matrix [4, 4], JSON text or nested numbers; raise InputError if it is not a similarity."""
     try:
         matrix = np.array(json.loads(value) if isinstance(value, str) else value, np.float64).reshape(4, 4)
         square = matrix[:3, :3] @ matrix[:3, :3].T

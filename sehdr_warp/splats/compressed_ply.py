@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import atomic_path
-from .arrays import HARMONIC_0, GaussianArrays, degree_of
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, stated_facts
 from .packing import from_smallest_three, logits, morton_order, smallest_three
 
 SUFFIX = ".compressed.ply"
@@ -70,11 +70,9 @@ def write_compressed_ply(path: Path, gaussians: GaussianArrays, overwrite: bool)
 
 def header_comments(gaussians: GaussianArrays) -> list[str]:
     """Return the comments of a PLY header that state what its properties do not."""
-    facts = {"color_model": gaussians.color_model, "base_exposure_time": repr(gaussians.base_time)}
-    if gaussians.photo_focals is not None:
-        facts["photo_focals"] = json.dumps(gaussians.photo_focals)
-    if gaussians.world_matrix is not None:
-        facts["world_matrix"] = json.dumps(gaussians.world_matrix.tolist(), separators=(",", ":"))
+    facts = {"color_model": gaussians.color_model} | {
+        name: json.dumps(value, separators=(",", ":")) for name, value in stated_facts(gaussians).items()
+    }
     return [*(f"sehdr:{name} {value}" for name, value in facts.items()), *[MIP] * gaussians.antialiased]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import HARMONIC_0, GaussianArrays, degree_of, join_gaussians, read_focals, read_matrix
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, join_gaussians, read_facts, stated_facts
 
 log = logging.getLogger(__name__)
 EXTENSION = "KHR_gaussian_splatting"
@@ -59,13 +59,7 @@ def write_glb(path: Path, gaussians: GaussianArrays, overwrite: bool) -> None:
         "attributes": {name: index for index, name in enumerate(attributes)},
         "extensions": {EXTENSION: extension},
     }
-    extras: dict[str, Any] = {"base_exposure_time": gaussians.base_time}
-    if gaussians.photo_focals is not None:
-        extras["photo_focals"] = list(gaussians.photo_focals)
-    if gaussians.antialiased:
-        extras["opacity_compensation"] = True
-    if gaussians.world_matrix is not None:
-        extras["world_matrix"] = gaussians.world_matrix.tolist()
+    extras = stated_facts(gaussians) | ({"opacity_compensation": True} if gaussians.antialiased else {})
     described = {
         "asset": {"version": "2.0", "generator": f"sehdr-warp {__version__}"},
         "extensionsUsed": [EXTENSION],
@@ -141,10 +135,8 @@ def _primitive(described: dict, binary: bytes, mesh: dict, primitive: dict, path
         opacity_logits=logits,
         harmonics=np.stack([values(name, 3) for name in _harmonic_names(degree)], axis=1),
         color_model="display",
-        base_time=float(extras.get("base_exposure_time", 1.0)),
-        world_matrix=read_matrix(extras.get("world_matrix"), path),
         antialiased=extras.get("opacity_compensation") is True,
-        photo_focals=read_focals(extras.get("photo_focals"), path),
+        **read_facts(extras, path),
     )
     return gaussians.without_filter(values(_FILTER, 1)[:, 0]) if _FILTER in attributes else gaussians
 

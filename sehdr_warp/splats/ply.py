@@ -14,7 +14,7 @@ import io
 import logging
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,17 +22,8 @@ from ..errors import InputError
 from ..files import atomic_path, plain_size
 from ..limits import available_memory
 from ..subsets import first_names
-from .arrays import (
-    HARMONIC_0,
-    LONGEST_TIME,
-    SHORTEST_TIME,
-    GaussianArrays,
-    degree_of,
-    log_compensation,
-    read_focals,
-    read_matrix,
-)
-from .compressed_ply import MIP, header_comments, unpack_ply
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_facts
+from .compressed_ply import header_comments, unpack_ply
 
 log = logging.getLogger(__name__)
 _FLAT = np.log(1e-6)  # Third log size of 2D Gaussian Splatting's files, which have two; as SuperSplat reads them
@@ -83,9 +74,9 @@ def read_ply(path: Path) -> GaussianArrays:
         vertex = read["vertex"]
         names = {each.name for each in vertex.properties}
         if "packed_position" in names:
-            facts = _facts(read.comments, path)._replace(color_model="display")
-            log_compensation(path, facts.antialiased, MIP)
-            return GaussianArrays(**unpack_ply(read, path), **facts._asdict())
+            facts = _facts(read.comments, path)
+            facts["color_model"] = "display"
+            return GaussianArrays(**unpack_ply(read, path), **facts)
         flat = "scale_2" not in names and {"scale_0", "scale_1", "rot_3"} <= names
         bytes_ = {each.name for each in vertex.properties if each.val_dtype == "u1"}
         rgb = not names & {"f_dc_0", "f_dc_1", "f_dc_2"} and bytes_.issuperset(_RGB)
@@ -125,11 +116,9 @@ def read_ply(path: Path) -> GaussianArrays:
     higher = higher.reshape(len(means), 3, len(rest) // 3).swapaxes(1, 2)
     harmonics = np.concatenate([constant[:, None], higher], axis=1)
     arrays = means, log_scales, quaternions, opacity[:, 0], harmonics
-    facts = _facts(read.comments, path)
-    gaussians = GaussianArrays(*arrays, **facts._asdict())
-    if facts.antialiased and facts.photo_focals is not None and "nx" in names and vertex["nx"].any():
+    gaussians = GaussianArrays(*arrays, **_facts(read.comments, path))
+    if gaussians.antialiased and gaussians.photo_focals is not None and "nx" in names and vertex["nx"].any():
         return gaussians.without_filter(np.asarray(vertex["nx"], np.float32))
-    log_compensation(path, facts.antialiased, MIP)
     return gaussians
 
 
@@ -200,29 +189,12 @@ def _start(path: Path) -> bytes:
         raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
 
 
-class _Facts(NamedTuple):
-    """Fields of GaussianArrays that the header states in comments."""
-
-    color_model: str
-    base_time: float
-    world_matrix: np.ndarray | None
-    antialiased: bool
-    photo_focals: tuple[float, float] | None
-
-
-def _facts(comments: list[str], path: Path) -> _Facts:
-    """Return what the header states; raise InputError for values that cannot be."""
+def _facts(comments: list[str], path: Path) -> dict[str, Any]:
+    """Return the fields of GaussianArrays that comments of the header state; raise InputError if one cannot be."""
     facts = dict(line.removeprefix("sehdr:").split(maxsplit=1) for line in comments if re.match(r"sehdr:\w+ \S", line))
     color_model = facts.get("color_model", "display")
-    try:
-        base_time = float(facts.get("base_exposure_time", 1.0))
-    except ValueError:
-        base_time = np.nan
-    if color_model not in _COLOR_MODELS or not SHORTEST_TIME <= base_time <= LONGEST_TIME:
-        problem = f"its header states color model {color_model!r:.40} at {base_time} s"
-        raise InputError(
-            path, problem, f"state one of {', '.join(_COLOR_MODELS)} and a time of {SHORTEST_TIME} to {LONGEST_TIME} s"
-        )
+    if color_model not in _COLOR_MODELS:
+        problem = f"its header states color model {color_model!r:.40}"
+        raise InputError(path, problem, f"state one of {', '.join(_COLOR_MODELS)}")
     antialiased = any(re.fullmatch(r"SplatRenderMode:\s*mip", line.strip(), re.IGNORECASE) for line in comments)
-    matrix, focals = read_matrix(facts.get("world_matrix"), path), read_focals(facts.get("photo_focals"), path)
-    return _Facts(color_model, base_time, matrix, antialiased, focals)
+    return read_facts(facts, path) | {"color_model": color_model, "antialiased": antialiased}

@@ -21,7 +21,7 @@ from PIL import Image
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
-from .arrays import GaussianArrays, log_compensation, read_focals, read_matrix
+from .arrays import GaussianArrays, read_facts, stated_facts
 from .packing import CODES, codebook, from_smallest_three, logits, morton_order, palette, smallest_three
 
 _LARGEST_PALETTE, _PER_ENTRY, _ACROSS = 1 << 14, 2, 64  # Entries; Gaussians for each; entries side by side
@@ -70,17 +70,11 @@ def sog_files(gaussians: GaussianArrays) -> Iterator[tuple[str, str | bytes]]:
             "codebook": color_levels.tolist(),
             "files": [pictures.add("sh0.webp", np.concatenate([color_codes, opacity[:, None]], axis=1))],
         },
-        "sehdr": {"base_exposure_time": gaussians.base_time},
+        "sehdr": stated_facts(gaussians),
     }
-    if gaussians.world_matrix is not None:
-        meta["sehdr"]["world_matrix"] = gaussians.world_matrix.tolist()
     if (shares := gaussians.filter_shares) is not None:
         levels, codes = codebook(np.sqrt(1 - np.square(np.clip(shares, 0, 1)))[:, None])
-        files = [pictures.add("filters.webp", codes)]
-        meta["sehdr"] |= {
-            "photo_focals": gaussians.photo_focals,
-            "filters": {"codebook": levels.tolist(), "files": files},
-        }
+        meta["sehdr"]["filters"] = {"codebook": levels.tolist(), "files": [pictures.add("filters.webp", codes)]}
     if gaussians.degree:
         meta["shN"] = _add_higher_harmonics(gaussians, pictures)
     yield "meta.json", json.dumps(meta)
@@ -144,9 +138,7 @@ def read_sog(path: Path) -> GaussianArrays:
                 raise ValueError(f"{name} has {sizes[above + name]} bytes")
             return archive.read(above + name)
 
-        gaussians = gaussians_of_files(read, path)
-    log_compensation(path, gaussians.antialiased, "its meta.json says antialias")
-    return gaussians
+        return gaussians_of_files(read, path)
 
 
 @contextmanager
@@ -213,10 +205,8 @@ def _gaussians(read: Callable[[str, int], bytes], meta: dict[str, Any], path: Pa
         opacity_logits=logits(color[:, 3] / 255),
         harmonics=harmonics,
         color_model="display",
-        base_time=float(facts.get("base_exposure_time", 1.0)),
-        world_matrix=read_matrix(facts.get("world_matrix"), path),
         antialiased=meta.get("antialias") is True,
-        photo_focals=read_focals(facts.get("photo_focals"), path),
+        **read_facts(facts, path),
     )
     if gaussians.photo_focals is None or not gaussians.antialiased or "filters" not in facts:
         return gaussians

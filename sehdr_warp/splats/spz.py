@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError, require_extra
 from ..files import atomic_path, read_bytes
-from .arrays import MAX_DEGREE, GaussianArrays, log_compensation
+from .arrays import MAX_DEGREE, GaussianArrays
 from .packing import from_smallest_three, logits, morton_order, smallest_three
 
 log = logging.getLogger(__name__)
@@ -116,7 +116,6 @@ def read_spz(path: Path) -> GaussianArrays:
         base_time=1.0,
         antialiased=bool(flags & _ANTIALIASED),
     )
-    log_compensation(path, gaussians.antialiased, "its header says antialiased")
     if flags & _EXTENDED:
         log.warning("%s: its extensions are not read; one of them may state other axes than SPZ's", path)
     return replace(gaussians.transformed(np.linalg.inv(_TO_FILE)), world_matrix=None)

@@ -14,7 +14,7 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_folder, read_bytes, read_json, resolve_inside
-from .arrays import GaussianArrays, join_gaussians, log_compensation
+from .arrays import GaussianArrays, join_gaussians
 from .sog import gaussians_of_files, refusing_damage, sog_files
 
 NAME = "lod-meta.json"
@@ -80,9 +80,7 @@ def read_streamed_sog(path: Path) -> GaussianArrays:
             chunks[chunk] = gaussians.rows(_rows(ranges, gaussians.count))
         if not chunks:
             raise ValueError("no node has Gaussians of level 0")
-    gaussians = join_gaussians([*chunks.values()])
-    log_compensation(path, gaussians.antialiased, "the meta.json of its chunks says antialias")
-    return gaussians
+    return join_gaussians([*chunks.values()])
 
 
 def _rows(ranges: list[tuple[int, int]], count: int) -> np.ndarray:

@@ -14,12 +14,16 @@ import numpy as np
 from ..errors import InputError, SehdrError, require_extra
 from ..files import atomic_path
 from ..sandbox import read_sandboxed
-from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_focals, read_matrix
+from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_facts, stated_facts
 
 COLOR_SPACE = "lin_rec709_scene"
-_BASE_TIME, _WORLD_MATRIX = "sehdr:baseExposureTime", "sehdr:worldMatrix"
-_FILTER, _FOCALS = "sehdr:filter", "sehdr:photoFocals"  # filter_shares and photo_focals of GaussianArrays
-_COMPENSATED = "sehdr:opacityCompensation"
+_FACTS = {
+    "base_exposure_time": ("sehdr:baseExposureTime", "Double"),
+    "photo_focals": ("sehdr:photoFocals", "DoubleArray"),
+    "world_matrix": ("sehdr:worldMatrix", "Matrix4d"),
+}
+"""Attribute and its type for each of stated_facts()."""
+_FILTER, _COMPENSATED = "sehdr:filter", "sehdr:opacityCompensation"  # filter_shares and antialiased
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _BIAS = 0.5 / HARMONIC_0
 _FAINTEST = 1 / 255  # Opacity below which programs draw nothing of a Gaussian
@@ -80,12 +84,11 @@ def _write_stage(path: Path, gaussians: GaussianArrays) -> None:
     prim = splat.GetPrim()
     stage.SetDefaultPrim(prim)
     Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOR_SPACE)
-    prim.CreateAttribute(_BASE_TIME, Sdf.ValueTypeNames.Double, True).Set(gaussians.base_time)
-    if gaussians.world_matrix is not None:
-        matrix = pxr("Gf").Matrix4d(gaussians.world_matrix.T.tolist())  # USD's matrices act on row vectors.
-        prim.CreateAttribute(_WORLD_MATRIX, Sdf.ValueTypeNames.Matrix4d, True).Set(matrix)
-    if gaussians.photo_focals is not None:
-        prim.CreateAttribute(_FOCALS, Sdf.ValueTypeNames.DoubleArray, True).Set(list(gaussians.photo_focals))
+    for fact, value in stated_facts(gaussians).items():
+        name, kind = _FACTS[fact]
+        if kind == "Matrix4d":
+            value = pxr("Gf").Matrix4d(np.array(value).T.tolist())  # USD's matrices act on row vectors.
+        prim.CreateAttribute(name, getattr(Sdf.ValueTypeNames, kind), True).Set(value)
     if gaussians.antialiased:
         prim.CreateAttribute(_COMPENSATED, Sdf.ValueTypeNames.Bool, True).Set(True)
     if (shares := gaussians.filter_shares) is not None:
@@ -131,7 +134,6 @@ def read_usd(path: Path) -> GaussianArrays:
     harmonics[:, 0] += _BIAS
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales, logits = np.log(scales), np.log(opacities) - np.log1p(-opacities)
-    matrix = read_matrix(arrays["world_matrix"], path)
     gaussians = GaussianArrays(
         means=means,
         log_scales=log_scales,
@@ -139,10 +141,8 @@ def read_usd(path: Path) -> GaussianArrays:
         opacity_logits=logits,
         harmonics=harmonics,
         color_model="linear",
-        base_time=float(arrays["base_time"]),
-        world_matrix=None if np.array_equal(matrix, np.eye(4)) else matrix,  # pyright: ignore[reportArgumentType]
         antialiased=bool(arrays["compensated"]),
-        photo_focals=read_focals(arrays.get("focals"), path),
+        **read_facts({name: arrays[name] for name in _FACTS if name in arrays}, path),
     )
     if _FILTER not in arrays:
         return gaussians
@@ -165,12 +165,11 @@ def usd_arrays(path: Path) -> dict[str, Any]:
         "space": str(Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) or ""),
         "matrix": np.array(to_world),
         "degree": int(_value(splat.GetRadianceSphericalHarmonicsDegreeAttr()) or 0),
-        "world_matrix": np.array(world.Get()).T if (world := prim.GetAttribute(_WORLD_MATRIX)) else np.eye(4),
-        "base_time": float(prim.GetAttribute(_BASE_TIME).Get()) if prim.HasAttribute(_BASE_TIME) else 1.0,
     }
     arrays["compensated"] = prim.HasAttribute(_COMPENSATED) and bool(prim.GetAttribute(_COMPENSATED).Get())
-    if prim.HasAttribute(_FOCALS):
-        arrays["focals"] = np.array(prim.GetAttribute(_FOCALS).Get(), np.float64)
+    for fact, (name, _) in _FACTS.items():
+        if prim.HasAttribute(name):
+            arrays[fact] = np.array(prim.GetAttribute(name).Get(), np.float64).T
     for name in ("positions", "scales", "orientations", "opacities", _HARMONICS, _FILTER):
         for value in filter(None, (_value(prim.GetAttribute(each)) for each in (f"{name}h", name))):
             arrays[name] = np.array(value, np.float32)

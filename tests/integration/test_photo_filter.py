@@ -82,7 +82,7 @@ def test_a_file_that_another_program_scales_is_read_alike(tmp_path, run, monkeyp
 def test_strange_focal_lengths_are_refused(tmp_path, run):
     file = export(run, tmp_path / "a.ply", axes="scene")
     data = file.read_bytes()
-    file.write_bytes(data.replace(b"photo_focals [40.0, 40.0]", b"photo_focals [40.0, 0.00]"))
+    file.write_bytes(data.replace(b"photo_focals [40.0,40.0]", b"photo_focals [40.0,0.00]"))
     with pytest.raises(InputError, match="focal lengths of the photos are .* not two positive numbers"):
         read_gaussians(file)
 

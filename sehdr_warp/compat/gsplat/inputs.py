@@ -20,6 +20,7 @@ UNSUPPORTED = {
     "tangential_coeffs": None,
     "thin_prism_coeffs": None,
     "ftheta_coeffs": None,
+    "rolling_shutter": None,
     "viewmats_rs": None,
     "return_normals": False,
     "global_z_order": True,
@@ -30,17 +31,20 @@ UNSUPPORTED = {
     "extra_signals_sh_degree": None,
     "renderer_config": None,
 }
-"""gsplat's arguments that have one value here."""
+"""gsplat's arguments that have one value here; rolling_shutter may also be its GLOBAL."""
 
 
-def check_supported(values: dict[str, Any], rolling_shutter: Any) -> None:
-    """Raise ValueError, by its name, for an argument with another value than UNSUPPORTED has."""
+def check_supported(values: dict[str, Any]) -> None:
+    """Raise ValueError, by its name, for an argument with another value than UNSUPPORTED has; TypeError for others."""
     for name, value in values.items():
-        if value is not UNSUPPORTED[name] and (isinstance(value, Tensor) or value != UNSUPPORTED[name]):
+        if name not in UNSUPPORTED:
+            raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
+        expected = UNSUPPORTED[name]
+        if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
+            continue
+        if value is not expected and (isinstance(value, Tensor) or value != expected):
             actual = f"a tensor of shape {list(value.shape)}" if isinstance(value, Tensor) else f"{value!r:.60}"
-            raise ValueError(f"{name} = {actual} is not supported, expected {UNSUPPORTED[name]!r}")
-    if rolling_shutter is not None and getattr(rolling_shutter, "name", None) != "GLOBAL":
-        raise ValueError(f"rolling_shutter = {rolling_shutter!r:.60} is not supported, expected a global shutter")
+            raise ValueError(f"{name} = {actual} is not supported, expected {expected!r}")
 
 
 class View(NamedTuple):

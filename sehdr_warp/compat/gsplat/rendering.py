@@ -11,7 +11,7 @@ from ...rasterizer.memory import oom_context
 from ...rasterizer.rasterization import render_projected, replay_projected
 from ...rasterizer.render_options import MAX_SIDE, RenderOptions
 from ...rasterizer.torch_contract import torch_operation
-from .inputs import UNSUPPORTED, check_supported, split_views
+from .inputs import check_supported, split_views
 from .projection import CameraModel, ProjectionOptions, project_gaussians
 from .splats import JoinedSplats, make_meta
 
@@ -49,23 +49,9 @@ def rasterization(
     camera_model: CameraModel = "pinhole",
     segmented: bool = False,
     covars: Tensor | None = None,
-    with_ut: bool = False,
-    with_eval3d: bool = False,
-    radial_coeffs: Tensor | None = None,
-    tangential_coeffs: Tensor | None = None,
-    thin_prism_coeffs: Tensor | None = None,
-    ftheta_coeffs: Any = None,
-    rolling_shutter: Any = None,
-    viewmats_rs: Tensor | None = None,
-    return_normals: bool = False,
-    global_z_order: bool = True,
-    rays: Tensor | None = None,
-    lidar_coeffs: Any = None,
-    external_distortion_coeffs: Any = None,
-    ut_params: Any = None,
+    *,
     extra_signals: Tensor | None = None,
-    extra_signals_sh_degree: int | None = None,
-    renderer_config: Any = None,
+    **unsupported: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Rasterize N Gaussians to the images of C cameras, with gsplat's arguments and results.
 
@@ -97,24 +83,9 @@ def rasterization(
         camera_model: "pinhole", "ortho" or "fisheye".
         segmented: has no effect.
         covars: [..., N, 3, 3] in place of quats and scales.
-        with_ut: must be False.
-        with_eval3d: must be False.
-        radial_coeffs: must be None.
-        tangential_coeffs: must be None.
-        thin_prism_coeffs: must be None.
-        ftheta_coeffs: must be None.
-        rolling_shutter: must be None or gsplat's GLOBAL.
-        viewmats_rs: must be None.
-        return_normals: must be False.
-        global_z_order: must be True.
-        rays: must be None.
-        lidar_coeffs: must be None.
-        external_distortion_coeffs: must be None.
-        ut_params: must be None.
         extra_signals: [..., N, E] or [..., C, N, E], blended to the third result's "render_extra_signals"
             [..., C, H, W, E].
-        extra_signals_sh_degree: must be None.
-        renderer_config: must be None.
+        **unsupported: gsplat's other arguments, which must have their default values; see docs/gsplat.md.
 
     Returns:
         Colors [..., C, H, W, D], with depths as one more channel ("RGB+D": blended, "RGB+ED": expected) or as the only
@@ -126,8 +97,7 @@ def rasterization(
         ValueError: for an argument that is not supported, by its name, and for shapes, dtypes or devices that do not
             fit.
     """
-    values = locals()
-    check_supported({name: values[name] for name in UNSUPPORTED}, rolling_shutter)
+    check_supported({"sparse_grad": sparse_grad, "distributed": distributed, **unsupported})
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode {render_mode!r} is none of {', '.join(RENDER_MODES)}")
     if rasterize_mode not in RASTERIZE_MODES:
