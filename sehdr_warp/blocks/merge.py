@@ -18,7 +18,7 @@ from torch import Tensor
 from ..errors import InputError
 from ..model.confidence import Evidence
 from ..model.gaussians import PARAMETER_NAMES
-from ..runs.checkpoint import PICTURE
+from ..runs.checkpoint import PICTURE, Checkpoint
 from ..runs.config_files import override_config
 from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter, write_confidence
@@ -88,7 +88,7 @@ def merge_blocks(out: Path, plan: BlockPlan, device: torch.device) -> RunWriter:
         info |= {"up": {"direction": direction.tolist(), "source": blocks[0].info["up"]["source"]}}
     seconds = sum(block.values["seconds"] for block in blocks)
     arrays = {f"gaussians.{name}": tensor for name, tensor in tensors.items()}
-    state = arrays, {"iteration": iterations, "seconds": seconds}
+    state = Checkpoint(arrays, {"iteration": iterations, "seconds": seconds})
     folder = RunWriter(out)
     folder.lock()
     try:

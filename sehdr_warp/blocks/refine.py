@@ -99,8 +99,8 @@ def _trainer(
     """Return the trainer of some rows of the merged scene, near the end of the block's training."""
     config = RunFolder(folder_of(out, plan, index)).read_config()
     # A dropout would leave out Gaussians that stay as they are, too: it costs 1 dB near borders.
-    still = {"mcmc.noise_lr": 0.0, "mcmc.seed_fraction": 0.0, "model.dropout": 0.0}
-    config = override_config(config, still | {"plan.keep": []})
+    still = {"densification.refine_stop_iter": 0, "mcmc.noise_lr": 0.0, "model.dropout": 0.0, "plan.keep": []}
+    config = override_config(config, still)
     gaussians = Gaussians(**{name: values[rows] for name, values in tensors.items()})
     response = response_for_training(scene, config)
     field = assemble_field(gaussians, config, response, plan.shared.base_time, plan.normalization)

@@ -1,6 +1,7 @@
 """Train a set of photos in blocks: plan, jobs, merged run with refined borders, its figures on held-out photos."""
 
 import logging
+import math
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -134,10 +135,11 @@ def _continue(out: Path, data: LoadArguments, config: Config, count: int | None)
 
 
 def _measure(run: Run, plan: BlockPlan) -> SeamErrors | None:
-    """Return the errors of the merged run on held-out photos; None if there are none."""
+    """Return the errors of the merged run on held-out photos; None without any pixel of one."""
     names = [entry.name for entry in run.cameras if entry.split == "test" and entry.camera.is_pinhole]
     names = every_nth(names, MOST_VIEWS)
     if not names:
         return None
     scene = plan.load_scene(names)
-    return measure_seams(run, run.normalize_photos(scene).views, plan.division)
+    errors = measure_seams(run, run.normalize_photos(scene).views, plan.division)
+    return None if math.isnan(errors.psnr) else errors  # Masks may exclude all pixels.

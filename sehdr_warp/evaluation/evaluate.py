@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,15 +30,6 @@ INFINITE_PSNR = "there is no error at all, so the PSNR is infinite"
 log = logging.getLogger(__name__)
 
 
-class Doubt(NamedTuple):
-    """Reliability of a prediction."""
-
-    confidence: Tensor
-    """[H, W] in [0, 1]."""
-    black: float
-    """Radiance that the photo shows as black."""
-
-
 @dataclass(frozen=True)
 class Predictions:
     """Predictions for the views of a scene.
@@ -47,30 +38,25 @@ class Predictions:
         hdr: Returns the radiance of a view, [H, W, 3].
         facts: Plain values for the result.
         ldr: Returns the simulated photo of a view, [H, W, 3] in [0, 1]; None if there is none.
-        confidence: Returns how reliable the prediction for a view is; None if that is not known.
+        confidence: Returns how reliable the prediction for a view is, [H, W] in [0, 1]; None if that is not known.
+        black: Largest exposure that photos show as black; matters if there is a confidence.
     """
 
     hdr: Callable[[View], Tensor]
     facts: dict[str, Any]
     ldr: Callable[[View], Tensor | None] = lambda view: None
-    confidence: Callable[[View], Doubt | None] = lambda view: None
+    confidence: Callable[[View], Tensor | None] = lambda view: None
+    black: float = 0.0
 
 
 def _run_predictions(run: "Run") -> Predictions:
     """Return the predictions of a trained run."""
-
-    def confidence(view: View) -> Doubt | None:
-        confidence = run.render_confidence(view.camera)
-        if confidence is None:
-            return None
-        black = run.response.decode(torch.full((1, 3), DARKEST_CODE, device=confidence.device))
-        return Doubt(confidence, float(black.mean()) / view.exposure_time)
-
     return Predictions(
         hdr=lambda view: run.render(view.camera).hdr,
         facts={"train_seconds": run.train_seconds, "gaussians": run.gaussian_count, "iterations": run.iterations},
         ldr=lambda view: run.render_ldr(view.camera, view.exposure_time),
-        confidence=confidence,
+        confidence=lambda view: run.render_confidence(view.camera),
+        black=float(run.response.decode(torch.full((1, 3), DARKEST_CODE, device=run.device)).mean()),
     )
 
 
@@ -215,8 +201,9 @@ class Evaluation:
             figures = metrics.psnr(*pair, mask), metrics.ssim(*pair, mask), self._lpips(*pair)
             ldr = dict(zip(ldr, figures, strict=True))
             compared.append(("ldr", *pair))
-        if truth is not None and (doubt := self.predictions.confidence(view)):
-            self.ranking.add(doubt.confidence, hdr, truth, regions["well-exposed"], doubt.black, mask)
+        if truth is not None and (confidence := self.predictions.confidence(view)) is not None:
+            black = self.predictions.black / view.exposure_time
+            self.ranking.add(confidence, hdr, truth, regions["well-exposed"], black, mask)
         if truth is not None and view.camera.is_pinhole:
             true_light, light = (image.mean(2).cpu().numpy() for image in (truth, hdr * (scale or 1.0)))
             self.lights += light_regions(true_light, light, view.camera, regions["clipped"].cpu().numpy())

@@ -270,6 +270,14 @@ def neighbor_distances(points: Tensor) -> Tensor:
     return torch.from_numpy(distances[:, 1:])
 
 
+def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate vectors [N, 3] by quaternions [N, 4] (w, x, y, z) of any length but zero."""
+    unit = nn.functional.normalize(quaternions, dim=1)
+    scalar, axis = unit[:, :1], unit[:, 1:]
+    cross = 2 * torch.linalg.cross(axis, vectors)
+    return vectors + scalar * cross + torch.linalg.cross(axis, cross)
+
+
 class ReservedRows:
     """Parameters and moments with memory for more Gaussians than there are, so that their number can change in place.
 

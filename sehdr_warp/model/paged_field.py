@@ -145,10 +145,10 @@ class PagedField(RadianceField):
         if not pages:
             pages = [self._empty()]
         joined = {name: torch.cat([page[name] for page in pages]) for name in pages[0]}
-        confidence = joined.pop("confidence", None)
         part = RadianceField(Gaussians(**joined), self.response, fusion=self.fusion, **_options(self))
         part.requires_grad_(False)
-        part.confidence = confidence
+        if self.confidence is not None:
+            part.confidence = self.confidence[self._rows(levels)].to(self.render_device)
         return part
 
     def _page(self, key: tuple[int, int]) -> dict[str, Tensor]:
@@ -158,8 +158,6 @@ class PagedField(RadianceField):
             rows = slice(cell * CELL, (cell + 1) * CELL)
             page = {name: tensor[rows] for name, tensor in self.gaussians.tensors().items()}
             page = coarser(page) if level else page
-            if self.confidence is not None:
-                page["confidence"] = self.confidence[rows][:: LEVEL_STEP if level else 1]
             self._pages[key] = {name: tensor.to(self.render_device) for name, tensor in page.items()}
         self._pages.move_to_end(key)
         return self._pages[key]
@@ -174,8 +172,6 @@ class PagedField(RadianceField):
         """Return one transparent Gaussian, for a camera that sees nothing."""
         page = {name: tensor[:1].to(self.render_device) for name, tensor in self.gaussians.tensors().items()}
         page["opacity_logits"] = torch.full_like(page["opacity_logits"], -20.0)
-        if self.confidence is not None:
-            page["confidence"] = self.confidence[:1].to(self.render_device)
         return page
 
 

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from ..rasterizer.render_options import EPS2D
 from ..scene import Camera
 from ..scene.wide_camera import pixels_of_directions
 from ..subsets import every_nth
+from .gaussians import rotate
 from .renders import CameraTensors
 
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
@@ -124,14 +124,8 @@ def keep_light(
     across = torch.stack([fx / z, zero, -fx * x / z**2], 1) @ pose[:3, :3]
     down = torch.stack([zero, fy / z, -fy * y / z**2], 1) @ pose[:3, :3]
     scales = log_scales.exp()
-    across, down = (_in_axes(quaternions, row) * scales for row in (across, down))
+    inverse = torch.cat([quaternions[:, :1], -quaternions[:, 1:]], dim=1)
+    across, down = (rotate(inverse, row) * scales for row in (across, down))
     area, spread = torch.linalg.cross(across, down).square().sum(1), (across**2 + down**2).sum(1)
     in_photos, in_render = (area + each * spread + each * each for each in (variance, EPS2D))
     return opacities * (in_photos / in_render).nan_to_num(1.0).sqrt()
-
-
-def _in_axes(quaternions: Tensor, vectors: Tensor) -> Tensor:
-    """Return vectors [N, 3] in the axes of rotations [N, 4], w first."""
-    w, axis = functional.normalize(quaternions, dim=1).split([1, 3], dim=1)
-    turned = 2 * torch.linalg.cross(-axis, vectors)
-    return vectors + w * turned + torch.linalg.cross(-axis, turned)

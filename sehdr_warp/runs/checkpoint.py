@@ -21,11 +21,15 @@ _OLDER = "remove this folder to use an older checkpoint, or train again"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint as read: its folder, named tensors on the CPU, and plain values."""
+    """Everything that determines the next step of a training, as named tensors and plain values.
 
-    path: Path
-    tensors: dict[str, Tensor]
+    On the CPU a training that continues from it repeats an uninterrupted one bit for bit. No global random state is
+    used.
+    """
+
+    tensors: dict[str, Tensor]  # On the CPU if it was read
     values: dict[str, Any]
+    path: Path = Path("memory")  # The folder that it was read from
 
 
 def read_checkpoint(path: Path, parts: tuple[str, ...] = ("",)) -> Checkpoint:
@@ -56,7 +60,7 @@ def read_checkpoint(path: Path, parts: tuple[str, ...] = ("",)) -> Checkpoint:
         raise InputError(file, f"is not safetensors ({error})", _OLDER) from None
     if (name := first_not_finite(tensors)) is not None:
         raise InputError(file, f"{name} holds values that are not finite", _OLDER)
-    return Checkpoint(path, tensors, values)
+    return Checkpoint(tensors, values, path)
 
 
 def _check_length(file: Path) -> None:

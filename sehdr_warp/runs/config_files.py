@@ -124,8 +124,8 @@ def config_as_toml(config: Config, differing: bool = False) -> str:
             meaning = " ".join((item.description or "").split())
             lines += textwrap.wrap(meaning, 116, initial_indent="# ", subsequent_indent="# ")
         changed = "" if differing or value == item.default else f"  # default: {json.dumps(item.default)}"
-        # JSON's strings, numbers, booleans and lists are TOML's as well.
-        lines.append(f"{name} = {json.dumps(value)}{changed}")
+        # JSON's strings, numbers, booleans and lists are TOML's as well, but for escapes of letters beyond 16 bits.
+        lines.append(f"{name} = {json.dumps(value, ensure_ascii=False)}{changed}")
     return "\n".join(lines)
 
 

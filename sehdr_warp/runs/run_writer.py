@@ -24,7 +24,7 @@ from ..model.radiance_field import RadianceField
 from ..scene import Scene
 from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.gravity import find_up
-from .checkpoint import TENSORS, VALUES, read_checkpoint, remove_checkpoint
+from .checkpoint import TENSORS, VALUES, Checkpoint, read_checkpoint, remove_checkpoint
 from .config import Config
 from .run_folder import EVIDENCE_TENSORS, NEW, READY, RunFolder, confidence_metadata
 from .scene_description import describe_scene
@@ -131,7 +131,7 @@ class RunWriter(RunFolder):
         field: RadianceField,
         data: LoadArguments,
         plan: dict | None,
-        state: tuple[dict[str, Tensor], dict],
+        state: Checkpoint,
         *,
         compensation: ExposureCompensation | None = None,
         overwrite: bool = False,
@@ -155,13 +155,11 @@ class RunWriter(RunFolder):
         info["up"] = find_up(scene).to_dict()
         self.replace_run(describe_scene(scene), info, config, plan, state)
 
-    def replace_run(
-        self, scene: dict, info: dict, config: Config, plan: dict | None, state: tuple[dict[str, Tensor], dict]
-    ) -> None:
+    def replace_run(self, scene: dict, info: dict, config: Config, plan: dict | None, state: Checkpoint) -> None:
         """Write the files of a new run in the locked folder, in place of those of an earlier one.
 
         `scene` is as from describe_scene(), `info` for run.json without format and version, `plan` for plan.json;
-        `state` are tensors and values of the first checkpoint.
+        `state` is the first checkpoint.
         """
         from .. import __version__
 
@@ -173,7 +171,7 @@ class RunWriter(RunFolder):
             write_json(new.scene_file, scene)
             write_json(new.info_file, info)
             write_json(new.config_file, config.model_dump())
-            new.write_checkpoint(*state, keep=1)
+            new.write_checkpoint(state.tensors, state.values, keep=1)
         self._finish_replacement()
         self._hashes, self.checkpoint_hash = new._hashes, new.checkpoint_hash
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,8 +26,8 @@ class TrainingMessage:
 
     config: Config  # Options of the training, after the plan
     info: dict[str, Any]  # Content of run.json
-    layout: dict[str, tuple[torch.Size, torch.dtype]]  # Shape and type of each tensor of its TrainingState
-    values: dict[str, Any]  # Values of its TrainingState
+    layout: dict[str, tuple[torch.Size, torch.dtype]]  # Shape and type of each tensor of its state
+    values: dict[str, Any]  # Values of its state
     scene: dict | None  # Description of the training views, for nodes that read photos themselves; None on one node
 
 
@@ -59,7 +58,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
 
     `path` says where the photos are on this node; by default they are where they are on that of rank 0.
     """
-    reads = ranks.info.node > 0 and ranks.info.is_local_main_process
+    reads = ranks.info.node > 0 and ranks.info.local_rank == 0
     scene = None
     if reads:
         request: PhotoRequest = ranks.requested_photos()
@@ -68,7 +67,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
     config = message.config
     tensors = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in message.layout.items()}
     ranks.broadcast_arrays(list(tensors.values()))
-    checkpoint = Checkpoint(Path("rank 0"), tensors, message.values)
+    checkpoint = Checkpoint(tensors, message.values)
     field = field_from_checkpoint(checkpoint, config, message.info)
     if scene is not None:
         scene = _in_world_of_rank_0(scene, message)

@@ -44,11 +44,6 @@ class RankInfo:
         """True if the processes are on several nodes."""
         return self.nodes > 1
 
-    @property
-    def is_local_main_process(self) -> bool:
-        """True for the process of a node that reads the photos for it."""
-        return self.local_rank == 0
-
     def __str__(self) -> str:
         """Return the rank, with its node if there are several."""
         where = f" on node {self.node} ({platform.node()})" if self.several_nodes else ""

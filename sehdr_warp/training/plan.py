@@ -158,21 +158,6 @@ def make_plan(
     return Plan(planned, facts, tuple(decisions), overridden)
 
 
-def apply_plan(scene: Scene, config: Config, device: torch.device) -> tuple[Config, Plan | None]:
-    """Return the config to train a scene with, and its plan if config.plan.enabled.
-
-    Without a plan, fields in plan.keep are checked against the scene all the same.
-
-    Raises:
-        InputError: As in make_plan().
-    """
-    if config.plan.enabled:
-        plan = make_plan(scene, config, device)
-        return plan.config, plan
-    check_fields(scene, config)
-    return config, None
-
-
 def check_scene(scene: Scene, facts: SceneFacts) -> None:
     """Raise InputError for a scene that no training can work with."""
     if facts.photos < FEWEST_PHOTOS:
@@ -263,7 +248,13 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> D
     fields: dict[str, object] = {}
     if _is_short_of_time(facts, config, device) and "mcmc.cap_density" not in config.plan.keep:
         fields = {"mcmc.cap_density": CPU_CAP_DENSITY}
-    elif device.type == "cuda" and _has_many_photos(facts) and _is_usual_density(config):
+    elif (
+        device.type == "cuda"
+        and facts.photos > MANY_PHOTOS
+        and facts.visibility >= LARGE_SCENE * facts.photos  # Each shows a good part of the scene.
+        and config.mcmc.cap_density == McmcConfig().cap_density
+        and "mcmc.cap_density" not in config.plan.keep
+    ):
         fields = {"mcmc.cap_density": GPU_CAP_DENSITY}
     config = override_config(config, fields, "plan")
     options = config.densification
@@ -284,16 +275,6 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> D
     most = min(options.cap_max, max(most, 2 * facts.points))
     reason += f"; {facts.points} points to start from"
     return Decision({"densification.cap_max": most}, f"{most} Gaussians", reason)
-
-
-def _has_many_photos(facts: SceneFacts) -> bool:
-    """Return whether there are more than MANY_PHOTOS photos, each of them of a good part of the scene."""
-    return facts.photos > MANY_PHOTOS and facts.visibility >= LARGE_SCENE * facts.photos
-
-
-def _is_usual_density(config: Config) -> bool:
-    """Return whether neither the user nor a preset chose mcmc.cap_density."""
-    return "mcmc.cap_density" not in config.plan.keep and config.mcmc.cap_density == McmcConfig().cap_density
 
 
 def _is_short_of_time(facts: SceneFacts, config: Config, device: torch.device) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -72,14 +72,15 @@ class RunOutput:
         if save and iteration < trainer.total and time.monotonic() - self._saved_at >= self._least_seconds:
             self.checkpoint(trainer)
         if self._tensorboard and trainer.came_to(self._log_every):
-            figures = {"loss": trainer.run_timed(lambda: trainer.loss), "psnr": trainer.psnr()}
+            figures = {"loss": trainer.loss, "psnr": trainer.psnr()}
             self._log(trainer, "train", figures | {"gaussians": trainer.field.gaussians.count})
 
     def evaluate(self, trainer: Trainer) -> None:
-        """Score the held-out views, if there are any, and append the scores to metrics.jsonl."""
-        if not trainer.scene.test_views:
+        """Score the held-out views that a mask does not exclude as a whole, and append the scores to metrics.jsonl."""
+        views = [view for view in trainer.scene.test_views if view.mask is None or view.mask.any()]
+        if not views:
             return
-        scores = evaluate_views(trainer.field, trainer.scene.test_views, trainer.degree)
+        scores = evaluate_views(trainer.field, views, trainer.degree)
         line = {"iteration": trainer.iteration, "seconds": round(trainer.seconds, 3), "split": "test"}
         line |= {name: round(value, 4) for name, value in scores.items()}
         self.folder.append_metrics(line | {"gaussians": trainer.field.gaussians.count})
@@ -191,7 +192,7 @@ def remove_unseen(trainer: Trainer) -> Evidence:
 
 
 @torch.no_grad()
-def evaluate_views(field: RadianceField, views: tuple[View, ...], degree: int) -> dict[str, float]:
+def evaluate_views(field: RadianceField, views: Sequence[View], degree: int) -> dict[str, float]:
     """Return mean scores over views, in dB; empty without views.
 
     Returns:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ..evaluation.metrics import psnr
 from ..model.renders import CameraTensors
 from ..rasterizer.losses.code_residual import CodeScale, code_tensor, code_values
 from ..response import Response
@@ -37,11 +38,8 @@ class Target:
         return code_values(select_view(self.codes, self.index))
 
     def psnr(self, encoded: Tensor) -> float:
-        """Return the PSNR of encoded values [H, W, 3] against the photo inside the mask, dB."""
-        squared = (encoded.clamp(0, 1) - self.encoded).square().mean(2, keepdim=True)
-        weights = torch.ones_like(squared) if self.mask is None else self.mask
-        mean = (squared * weights).sum() / weights.sum().clamp_min(1e-6)
-        return float(-10 * mean.clamp_min(1e-10).log10())
+        """Return the PSNR of encoded values [H, W, 3] against the photo inside the mask, dB; NaN if it is empty."""
+        return psnr(encoded.clamp(0, 1), self.encoded, None if self.mask is None else self.mask[..., 0])
 
 
 def select_view(stack: Tensor, index: Tensor | None) -> Tensor:

@@ -27,7 +27,7 @@ from .compensation import SharedDecisions, estimate_compensation, estimates_comp
 from .following import send_training, several_ranks_notes
 from .initialization import brighten_clipped, make_field, make_matcher, response_for_training, sizes_of
 from .machine import summary_writer
-from .plan import apply_plan
+from .plan import check_fields, make_plan
 from .ranks import Ranks
 from .run_output import RunOutput
 from .scene_facts import check_scene_truth
@@ -138,7 +138,11 @@ def _new_trainer(
 ) -> Trainer:
     """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder."""
     normalization = normalization_of(scene)
-    config, plan = apply_plan(normalization.scene(scene), config, device)
+    plan = make_plan(normalization.scene(scene), config, device) if config.plan.enabled else None
+    if plan is None:
+        check_fields(normalization.scene(scene), config)
+    else:
+        config = plan.config
     check_scene_truth(scene, config.loss)  # Here, before the photos are matched; GradientStep repeats it.
     response = response_for_training(scene, config)
     started = time.perf_counter()
@@ -175,7 +179,10 @@ def _resumed_trainer(
         config = _with_decisions(config, saved, folder)
         saved = override_config(saved, {"schedule.iterations": max(before, config.schedule.iterations)})
         require_same_config(config, saved, folder.config_file, "resume with the run's own config, or train anew")
-    scene = _in_world_of_run(scene, folder, info)
+    # The Gaussians are in the world that structure from motion found when the training began.
+    cameras = {entry.name: entry.camera for entry in folder.read_cameras()} if scene.format in FOUND else {}
+    unit = Normalization.from_dict(info.get("normalization")).unit
+    scene = in_world_of_run(scene, cameras, unit, folder.path, scene.name)
     folder.check_same_scene(scene)
     checkpoint = folder.newest_checkpoint()
     if checkpoint is None:
@@ -196,15 +203,6 @@ def _resumed_trainer(
         log.info(text, before, trainer.total)
     folder.rewind_metrics(trainer.iteration)
     return trainer
-
-
-def _in_world_of_run(scene: Scene, folder: RunWriter, info: dict[str, Any]) -> Scene:
-    """Return a scene with the cameras of a run if structure from motion found them; the Gaussians are in its world."""
-    if scene.format not in FOUND:
-        return scene
-    cameras = {entry.name: entry.camera for entry in folder.read_cameras()}
-    unit = Normalization.from_dict(info.get("normalization")).unit
-    return in_world_of_run(scene, cameras, unit, folder.path, scene.name)
 
 
 def _with_decisions(config: Config, saved: Config, folder: RunWriter) -> Config:

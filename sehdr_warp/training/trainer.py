@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache, partial
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -44,8 +43,6 @@ from .training_state import TrainingProgress
 from .training_views import PhotoOrder, TrainingViews, check_projections, first_non_pinhole
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 CHECK_EVERY = 20  # Iterations between checks of the counts that steps keep on the device
 COMPARE_EVERY = 500  # Iterations between checks that all ranks have the same Gaussians
@@ -154,7 +151,8 @@ class Trainer:
             try:
                 while self._agree_to_continue():
                     before = self.seconds
-                    self.run_timed(self.step)
+                    with self._timed():
+                        self.step()
                     if self.output is not None:  # Evaluation, checkpoint, log.
                         self.output.after_step(self)
                     yield TrainingProgress(self, self._estimate_seconds_left(self.seconds - before))
@@ -304,23 +302,26 @@ class Trainer:
             self.ranks.reduce_to_main(list(self.strategy.state_dict(self.field.gaussians.count).values()))
             self.ranks.check_equal(self.field.gaussians.tensors(), self.iteration)
 
-    def run_timed(self, function: Callable[[], T]) -> T:
-        """Call a function, and count the time that it takes on the host as time of the training."""
+    @contextmanager
+    def _timed(self) -> Iterator[None]:
+        """Count the time that a block takes on the host as time of the training."""
         started = time.perf_counter()
         try:
-            return function()
+            yield
         finally:
             self.seconds += time.perf_counter() - started
 
     def synchronize(self) -> None:
         """Wait for the device, as part of the training's time."""
         if self.device.type == "cuda":
-            self.run_timed(lambda: torch.cuda.synchronize(self.device))
+            with self._timed():
+                torch.cuda.synchronize(self.device)
 
     @property
     def loss(self) -> float:
         """Loss of the last step, read from the device; NaN before the first."""
-        return float("nan") if self._result is None else float(self._result.loss)
+        with self._timed():
+            return float("nan") if self._result is None else float(self._result.loss)
 
     @torch.no_grad()
     def psnr(self) -> float:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from ..runs.checkpoint import Checkpoint, under
 from .optimizer import load_optimizer_tensors, optimizer_tensors
@@ -14,19 +13,8 @@ if TYPE_CHECKING:
     from .trainer import Trainer
 
 
-class TrainingState(NamedTuple):
-    """Everything that determines the next step of a training, as named tensors and plain values.
-
-    On the CPU a training that continues from it repeats an uninterrupted one bit for bit. No global random state is
-    used.
-    """
-
-    tensors: dict[str, Tensor]
-    values: dict[str, Any]
-
-
-def state_of(trainer: Trainer) -> TrainingState:
-    """Return the state of a trainer."""
+def state_of(trainer: Trainer) -> Checkpoint:
+    """Return the state of a trainer; its tensors change with the next step."""
     field = trainer.field
     parts = {
         "gaussians": field.gaussians.tensors(),
@@ -42,16 +30,18 @@ def state_of(trainer: Trainer) -> TrainingState:
     counts = {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
     values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining} | counts
     values["large_scene"] = trainer.large_scene
-    return TrainingState(tensors, values)
+    return Checkpoint(tensors, values)
 
 
-def load_state(trainer: Trainer, state: TrainingState | Checkpoint) -> None:
+def load_state(trainer: Trainer, state: Checkpoint) -> None:
     """Continue from a state; the Gaussians of the trainer's field must already be those of the state."""
     tensors, values, device = state.tensors, state.values, trainer.device
     load_optimizer_tensors(trainer.optimizer, under(tensors, "optimizer."), trainer.batch)
     statistics = {name: value.to(device) for name, value in under(tensors, "densification.").items()}
     trainer.strategy.load_state_dict(statistics)
-    trainer.average.means = {name: value.to(device) for name, value in under(tensors, "average.").items()}
+    # A stretched schedule may start its average later: samples until now are then of other Gaussians.
+    average = under(tensors, "average.") if values["iteration"] > trainer.average.first else {}
+    trainer.average.means = {name: value.to(device) for name, value in average.items()}
     if trainer.ranks is not None and not trainer.ranks.is_main_process:  # The sum over the ranks counts them once.
         for total in statistics.values():
             total.zero_()
@@ -90,7 +80,7 @@ class TrainingProgress:
     @property
     def loss(self) -> float:
         """Loss of the step."""
-        return self._trainer.run_timed(lambda: self._trainer.loss)
+        return self._trainer.loss
 
     @property
     def psnr(self) -> float:

@@ -7,8 +7,10 @@ from sehdr_warp.blocks.job import folder_of
 from sehdr_warp.blocks.refine import BAND, refine_borders
 from sehdr_warp.blocks.seams import measure_seams
 from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
+from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.open import load_scene_and_log_notes
 from sehdr_warp.runs.run import load_run
+from sehdr_warp.runs.run_folder import RunFolder
 
 
 def merged_rows(out, plan):
@@ -48,6 +50,18 @@ def test_only_gaussians_near_borders_change_and_the_border_gets_better(two_block
         run.field.gaussians = Gaussians(**tensors)
         errors.append(measure_seams(run, views, plan.division).border)
     assert errors[1] > errors[0] + 0.2
+
+
+def test_no_gaussians_are_added_near_borders_even_if_the_blocks_were_densified_to_their_end(two_blocks, monkeypatch):
+    out, plan = two_blocks(150)
+    read_config, late = RunFolder.read_config, {"densification.refine_stop_iter": 30_000, "mcmc.cap_density": 1000.0}
+    monkeypatch.setattr(RunFolder, "read_config", lambda folder: override_config(read_config(folder), late))
+    before, blocks = merged_rows(out, plan)
+    after = {name: values.clone() for name, values in before.items()}
+    refine_borders(after, blocks, out, plan, torch.device("cpu"))
+    places = plan.normalization.scene_points(before["means"].numpy())
+    far = plan.division.border_distance(places) > BAND * plan.division.margins.max()
+    assert far.any() and all(torch.equal(after[name][far], before[name][far]) for name in before)
 
 
 def test_the_rows_around_trained_gaussians_are_rendered_and_stay(two_blocks):

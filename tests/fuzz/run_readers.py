@@ -46,8 +46,9 @@ def make_run(folder: Path) -> None:
     scene = toy_scene(2, 8)
     field = assemble_field(gaussians, config, response_by_name("srgb"), 0.25)
     run = RunWriter(folder)
-    tensors, values = state_of(Trainer(scene, config, field))
-    run.begin(scene, config, field, {"path": "embedded"}, PLAN, (tensors, values | {"seconds": 1.0}))
+    state = state_of(Trainer(scene, config, field))
+    state.values["seconds"] = 1.0
+    run.begin(scene, config, field, {"path": "embedded"}, PLAN, state)
     run.unlock()
     run.append_metrics({"iteration": 1, "seconds": 0.5, "psnr_ldr": 20.0})
     run.write_summary(SUMMARY)

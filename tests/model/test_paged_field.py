@@ -80,6 +80,17 @@ def test_directions_are_those_of_the_whole(street):
         torch.testing.assert_close(getattr(whole, name), getattr(part, name))
 
 
+def test_confidence_that_is_measured_between_two_pictures_is_in_the_second(street):
+    confidence, street.confidence = street.confidence, None
+    paged = PagedField(street, CPU, budget=10**9)
+    rays = torch.nn.functional.normalize(torch.randn(4, 6, 3, generator=torch.Generator().manual_seed(0)), dim=2)
+    options = {"position": np.array([20.0, 0, 1]), "directions": rays, "focal_length": 10.0, "pixel_angle": 0.1}
+    assert paged.render_directions(**options).confidence is None
+    street.confidence = paged.confidence = confidence
+    found = paged.render_directions(**options).confidence
+    torch.testing.assert_close(found, street.render_directions(**options).confidence)
+
+
 def test_far_cells_are_taken_at_a_lower_level_of_detail(street):
     place = camera(1, ahead=6, height=1.0)
     visible = len(PagedField(street, CPU, 10**9).levels(place, place.position))

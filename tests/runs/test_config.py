@@ -43,6 +43,12 @@ def test_a_config_as_toml_is_read_back(name, differing, tmp_path):
     assert load_config(tmp_path / "own.toml") == config
 
 
+def test_any_letter_of_a_file_name_is_read_back(tmp_path):
+    config = load_config("default", {"model.init_file": "\U0001f642 \u00e9.ply"})
+    (tmp_path / "own.toml").write_text(config_as_toml(config, True), encoding="utf-8")
+    assert load_config(tmp_path / "own.toml") == config
+
+
 def test_what_differs_is_marked():
     lines = config_as_toml(load_config("default", {"loss.clipping": False})).splitlines()
     assert [line for line in lines if "default:" in line] == ["clipping = false  # default: true"]

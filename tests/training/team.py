@@ -46,7 +46,8 @@ def train_together(ranks, folder: Path, strategies: list[str], iterations: int) 
             trainer = train_as_worker(ranks)
         ranks.all_reduce_min(2)
         assert "torch._dynamo" not in sys.modules, "two seconds of every start"
-        torch.save(tuple(state_of(trainer)), folder / f"{strategy}.{ranks.rank}")
+        state = state_of(trainer)
+        torch.save((state.tensors, state.values), folder / f"{strategy}.{ranks.rank}")
 
 
 def differ(ranks, folder: Path) -> None:

@@ -17,7 +17,6 @@ from sehdr_warp.training.plan import (
     RULES,
     SCALED_RATES,
     Decision,
-    apply_plan,
     cpu_step_seconds,
     make_plan,
 )
@@ -326,12 +325,12 @@ def test_values_that_the_scene_contradicts_are_refused_with_both(scene, changes,
     config = load_config("default", {"response.name": "srgb", "plan.keep": list(changes), **changes})
     for planned in (config, load_config("default", changes | {"plan.enabled": True, "plan.keep": list(changes)})):
         with pytest.raises(InputError) as caught:
-            apply_plan(scene, planned, CPU)
+            make_plan(scene, planned, CPU)
         for word in words:
             assert word in str(caught.value)
     assert "\n" not in str(caught.value)
     # What a preset states is not the user's contradiction.
-    apply_plan(scene, load_config("default", changes), CPU)
+    make_plan(scene, load_config("default", changes), CPU)
 
 
 def test_a_training_follows_its_plan_and_keeps_it(scene, tmp_path):

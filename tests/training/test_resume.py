@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,6 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.runs.checkpoint import Checkpoint
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
@@ -20,7 +20,7 @@ from sehdr_warp.scene import response_choice
 from sehdr_warp.training.run_output import remove_unseen
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
-from sehdr_warp.training.training_state import TrainingState, load_state, state_of
+from sehdr_warp.training.training_state import load_state, state_of
 
 from ..refusals import call
 from .toy import VARIANTS, make_trainer, quick, toy_scene, without_truth
@@ -133,14 +133,13 @@ def test_a_trainer_continues_from_its_state(scene, variant):
     try:
         whole = make_trainer(scene, config)
         _steps(whole, 30)
-        tensors, values = state_of(whole)
-        tensors = {name: value.clone() for name, value in tensors.items()}
+        state = deepcopy(state_of(whole))
         info = {"response": whole.field.response.to_dict(), "base_time": whole.field.base_time}
         info["normalization"] = whole.field.normalization.to_dict()
-        field = field_from_checkpoint(Checkpoint(Path("memory"), tensors, values), config, info)
-        values["overflowed_steps"] = 3
+        field = field_from_checkpoint(state, config, info)
+        state.values["overflowed_steps"] = 3
         resumed = Trainer(scene, config, field)
-        load_state(resumed, TrainingState(tensors, values))
+        load_state(resumed, state)
         for trainer in (whole, resumed):
             _steps(trainer, 25)
     finally:
@@ -175,6 +174,20 @@ def test_resume_refuses_another_config_or_scene(scene, tmp_path):
         train(scene, tmp_path / "run", override_config(short, {"seed": 1}), device="cpu", resume=True)
     with pytest.raises(InputError, match="views differ"):
         train(toy_scene(view_count=6), tmp_path / "run", short, device="cpu", resume=True)
+
+
+def test_a_run_that_was_left_in_its_moving_average_goes_on_with_more_iterations(tmp_path):
+    """The number of Gaussians changes again before the average of the longer training begins."""
+    config = quick(**{"densification.cap_max": 5000})
+    trainer = create_trainer(toy_scene(), tmp_path / "run", config, device="cpu")
+    for progress in trainer:
+        if progress.iteration == 89:
+            break
+    assert trainer.average.means
+    longer = override_config(config, {"schedule.iterations": 180})
+    resumed = create_trainer(toy_scene(), tmp_path / "run", longer, device="cpu", resume=True)
+    count = resumed.field.gaussians.count
+    assert resumed.train().iterations == 180 and resumed.field.gaussians.count != count
 
 
 def test_resuming_with_the_same_config_keeps_the_planned_length(scene, tmp_path):

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians
+from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians, rotate
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.rasterizer.ops.relocation import relocation_sums
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.training.strategies import AdcStrategy, Proposals, make_strategy, mcmc
-from sehdr_warp.training.strategies.adc import rotate, sample_half
+from sehdr_warp.training.strategies import Proposals, make_strategy, mcmc
+from sehdr_warp.training.strategies.adc import sample_half
 from sehdr_warp.training.strategies.mcmc import sample_rows
 
 
@@ -42,7 +42,7 @@ def rendering_with(gradient, visible):
 def adc_strategy(**options):
     values = {"densification.strategy": "adc"}
     values |= {f"densification.{name}": value for name, value in options.items()}
-    return AdcStrategy.from_config(load_config("default", values))
+    return make_strategy(load_config("default", values), 10**6)
 
 
 def observe(strategy, gradients):

@@ -1,7 +1,7 @@
 """Whole trainings of seconds: they learn, they report, they stop tidily, and they refuse what cannot work."""
 
-import dataclasses
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,7 +75,7 @@ def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, caplog):
 
 
 def test_the_response_of_linear_photos_is_that_of_simulated_photos_alone(scene, tmp_path, logged):
-    linear = dataclasses.replace(scene, light_known=True, response=response_by_name("srgb"))
+    linear = replace(scene, light_known=True, response=response_by_name("srgb"))
     for name, photos in (("coded", scene), ("linear", linear)):
         create_trainer(photos, tmp_path / name, quick(**{"response.name": "srgb"}), device="cpu")
     lines = [line for line in logged if line.startswith("response srgb")]
@@ -104,8 +104,8 @@ def test_views_of_differing_exposure_agree(tmp_path):
     for index, view in enumerate(base.views):
         time = EXPOSURE_TIME * (2 if index % 2 else 1)
         photo = np.round(srgb.encode(view.hdr * time) * 255).astype(np.float32) / 255
-        views.append(dataclasses.replace(view, codes=codes_of(photo), exposure_time=time))
-    run = train(dataclasses.replace(base, views=tuple(views)), tmp_path / "run", quick(), device="cpu")
+        views.append(replace(view, codes=codes_of(photo), exposure_time=time))
+    run = train(replace(base, views=tuple(views)), tmp_path / "run", quick(), device="cpu")
     # Taken for equal, the times would leave the simulated photos a stop off: below 15 dB.
     assert run.metrics()[-1]["psnr_ldr"] > 18
     assert run.metrics()[-1]["psnr_mu"] > 19
@@ -113,11 +113,11 @@ def test_views_of_differing_exposure_agree(tmp_path):
 
 def test_clipped_highlights_are_not_pulled_down(scene, tmp_path):
     """Photos of more than the sensor holds: the render is white there, and not held to just white."""
-    views = tuple(dataclasses.replace(view, codes=np.full_like(view.codes, 255)) for view in scene.views)
+    views = tuple(replace(view, codes=np.full_like(view.codes, 255)) for view in scene.views)
     field = make_field(scene, quick(), response_for_training(scene, quick()), "cpu")
     bound = {"loss.ssim_weight": 0.0, "loss.clipped_smoothness": 0.0, "loss.clipped_estimate": 0.0}
     config = quick(**bound)
-    trainer = Trainer(dataclasses.replace(scene, views=views), config, field)
+    trainer = Trainer(replace(scene, views=views), config, field)
     with torch.no_grad():
         field.gaussians.harmonics_dc.fill_(8.0)
         field.gaussians.opacity_logits.fill_(20.0)
@@ -173,7 +173,7 @@ def test_new_gaussians_of_a_large_scene_do_not_fade_before_a_photo_shows_them(sc
     if large:  # A photo shows less than a tenth of the points.
         elsewhere = np.tile(scene.points, (12, 1)) + 1e3
         points = np.concatenate([scene.points, elsewhere])
-        scene = dataclasses.replace(scene, points=points, point_colors=np.tile(scene.point_colors, (13, 1)))
+        scene = replace(scene, points=points, point_colors=np.tile(scene.point_colors, (13, 1)))
     trainer = make_trainer(scene, config, device)
     gaussians = trainer.field.gaussians
     for _ in range(10):
@@ -228,13 +228,13 @@ def test_non_finite_steps_are_skipped_and_then_stop(scene):
 
 @pytest.mark.parametrize("value,words", [(0.0, "black"), (1.0, "white")])
 def test_photos_without_light_or_shadow_are_refused(scene, tmp_path, value, words):
-    views = tuple(dataclasses.replace(view, codes=codes_of(np.full_like(view.image, value))) for view in scene.views)
+    views = tuple(replace(view, codes=codes_of(np.full_like(view.image, value))) for view in scene.views)
     with pytest.raises(InputError, match=words):
-        train(dataclasses.replace(scene, views=views), tmp_path / "run", quick(), device="cpu")
+        train(replace(scene, views=views), tmp_path / "run", quick(), device="cpu")
 
 
 def test_one_view_is_refused_and_the_folder_stays_as_it_is(scene, tmp_path):
-    one = dataclasses.replace(scene, views=scene.views[:1])
+    one = replace(scene, views=scene.views[:1])
     with pytest.raises(InputError, match="1 training view"):
         train(one, tmp_path / "run", quick(), device="cpu")
     assert not (tmp_path / "run").exists()
@@ -273,6 +273,14 @@ def test_held_out_figures_are_told_in_words(scene, tmp_path, logged):
     last = train(scene, tmp_path / "run", short, device="cpu").metrics()[-1]
     figures = f"held-out photos {last['psnr_ldr']:.1f} dB, HDR {last['psnr_mu']:.1f} dB (mu-law)"
     assert any(line.startswith(f"iteration 4: {figures}, after ") for line in logged)
+
+
+@pytest.mark.parametrize("excluded", [(3,), (3, 7)])
+def test_held_out_photos_that_a_mask_excludes_have_no_figures(scene, tmp_path, excluded):
+    nothing = np.zeros((32, 32), np.float32)
+    views = tuple(replace(view, mask=nothing) if k in excluded else view for k, view in enumerate(scene.views))
+    run = train(replace(scene, views=views), tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
+    assert bool(run.metrics()) == (len(excluded) == 1), "NaN would be left out by every reader"
 
 
 def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path):

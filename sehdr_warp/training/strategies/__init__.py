@@ -4,12 +4,14 @@
 density control of 3D Gaussian Splatting (Kerbl et al. 2023, section 5.2, with the constants of its code).
 """
 
+import math
+
 from torch import Tensor
 
 from ...runs.config import Config
 from .adc import AdcStrategy
-from .base import SEED_STRIDE, Proposals, Propose, Strategy
-from .mcmc import McmcStrategy, mcmc_cap
+from .base import SEED_STRIDE, Proposals, Propose, Schedule, Strategy
+from .mcmc import DENSE, McmcStrategy, mcmc_cap
 
 __all__ = [
     "SEED_STRIDE",
@@ -31,6 +33,17 @@ def make_strategy(
     The training photos have `pixels` in all and camera_positions [V, 3], in the Gaussians' coordinates. large_scene: as
     of scene_facts.is_large().
     """
+    schedule, prune_opacity = Schedule.from_config(config), config.densification.prune_opacity
     if config.densification.strategy == "adc":
-        return AdcStrategy.from_config(config)
-    return McmcStrategy.from_config(config, pixels, camera_positions, large_scene=large_scene)
+        cap, reset_every = config.densification.cap_max, config.scaled(config.adc.reset_every)
+        return AdcStrategy(schedule, cap, prune_opacity, options=config.adc, reset_every=reset_every)
+    cap = mcmc_cap(config, pixels)
+    return McmcStrategy(
+        schedule,
+        cap,
+        prune_opacity,
+        options=config.mcmc,
+        random_seed=config.seed,
+        camera_positions=camera_positions,
+        dense=large_scene and cap > DENSE * math.sqrt(pixels),
+    )

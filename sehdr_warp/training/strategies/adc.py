@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer
+from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, rotate
 from ...rasterizer import Rendering
 from ...rasterizer.ops.step_updates import add_gradient_statistics
-from ...runs.config import AdcConfig, Config
-from .base import Propose, Schedule, Strategy
+from ...runs.config import AdcConfig
+from .base import Propose, Strategy
 
 SPLIT_SHRINK = 1.6  # Factor by which the two halves of a split are smaller (3DGS: 0.8 times the number of halves)
 MIN_RESET_INTERVAL = 300
@@ -30,17 +30,6 @@ class AdcStrategy(Strategy):
     # Sum of the gradients of the projected means, [rows], in normalized screen units
     gradient_sum: Tensor | None = None
     photo_count: Tensor | None = None  # Number of photos in that sum, [rows]
-
-    @staticmethod
-    def from_config(config: Config) -> "AdcStrategy":
-        """Create the strategy of a config."""
-        return AdcStrategy(
-            schedule=Schedule.from_config(config),
-            cap_max=config.densification.cap_max,
-            prune_opacity=config.densification.prune_opacity,
-            options=config.adc,
-            reset_every=config.scaled(config.adc.reset_every),
-        )
 
     def needs_gradients(self, iteration: int) -> bool:
         """Return True until refinement stops."""
@@ -75,7 +64,9 @@ class AdcStrategy(Strategy):
         if self.schedule.is_due(iteration, step_batch) and total is not None and count is not None:
             changed = True
             small, large = self._select(gaussians, (total / count.clamp_min(1))[: gaussians.count])
-            added = [self.duplicate(gaussians, small), *self.split(gaussians, large, generator)]
+            parents = large.nonzero()[:, 0]
+            added = [gaussians.rows(small.nonzero()[:, 0])]
+            added += [sample_half(gaussians, parents, generator) for _ in range(2)]
             added = {name: torch.cat([rows[name] for rows in added]) for name in PARAMETER_NAMES}
             self.remove(gaussians, optimizer, large, added, oversized=iteration > self.reset_every)
             # In place, because captured steps add to these tensors.
@@ -107,17 +98,6 @@ class AdcStrategy(Strategy):
             selected = torch.zeros_like(selected).index_fill_(0, first, True) & selected
         small = gaussians.log_scales.amax(1) <= math.log(self.options.grow_scale3d)
         return selected & small, selected & ~small
-
-    @staticmethod
-    def duplicate(gaussians: Gaussians, mask: Tensor) -> dict[str, Tensor]:
-        """Return copies of the Gaussians in a mask [N]."""
-        return gaussians.rows(mask.nonzero()[:, 0])
-
-    @staticmethod
-    def split(gaussians: Gaussians, mask: Tensor, generator: torch.Generator) -> list[dict[str, Tensor]]:
-        """Return two smaller Gaussians, at points sampled from it, for each one in a mask [N]."""
-        parents = mask.nonzero()[:, 0]
-        return [sample_half(gaussians, parents, generator) for _ in range(2)]
 
     def remove(
         self,
@@ -173,14 +153,6 @@ def sample_half(gaussians: Gaussians, parents: Tensor, generator: torch.Generato
     rows["means"] += rotate(rows["quaternions"], normal * rows["log_scales"].exp())
     rows["log_scales"] -= math.log(SPLIT_SHRINK)
     return rows
-
-
-def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate vectors [N, 3] by quaternions [N, 4] (w, x, y, z) of any length but zero."""
-    unit = torch.nn.functional.normalize(quaternions, dim=1)
-    scalar, axis = unit[:, :1], unit[:, 1:]
-    cross = 2 * torch.linalg.cross(axis, vectors)
-    return vectors + scalar * cross + torch.linalg.cross(axis, cross)
 
 
 def _resize(values: Tensor | None, rows: int, device: torch.device | str) -> Tensor:

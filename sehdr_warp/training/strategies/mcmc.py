@@ -17,7 +17,7 @@ from ...rasterizer.ops.relocation import (
 )
 from ...rasterizer.ops.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
-from .base import SEED_STRIDE, Propose, Schedule, Strategy
+from .base import SEED_STRIDE, Propose, Strategy
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
 DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
@@ -61,22 +61,6 @@ class McmcStrategy(Strategy):
     camera_positions: Tensor | None = None  # [V, 3] positions of the training cameras, for prune_near_angle
     dense: bool = False  # Whether copies take over the second moments of their source, see reset_moments()
 
-    @staticmethod
-    def from_config(
-        config: Config, pixels: int, camera_positions: Tensor | None = None, *, large_scene: bool = False
-    ) -> "McmcStrategy":
-        """Create the strategy of a config for training photos with `pixels` pixels in total."""
-        cap_max = mcmc_cap(config, pixels)
-        return McmcStrategy(
-            schedule=Schedule.from_config(config),
-            cap_max=cap_max,
-            prune_opacity=config.densification.prune_opacity,
-            options=config.mcmc,
-            random_seed=config.seed,
-            camera_positions=camera_positions,
-            dense=large_scene and cap_max > DENSE * math.sqrt(pixels),
-        )
-
     @torch.no_grad()
     def refine(
         self,
@@ -108,7 +92,9 @@ class McmcStrategy(Strategy):
         seeded = self.fill_proposals(refinement, dead_count, added, propose)
         self.relocate(refinement, opacities.masked_fill(dead, 0), seeded, dead_count, count)
         if added > 0:
-            self.sample_add(refinement, torch.maximum(dead_count, seeded), dead_count + added, added)
+            first = torch.maximum(dead_count, seeded)
+            weights = gaussians.opacities().masked_fill_(slot_of_row >= first, 0)
+            self.relocate(refinement, weights, first, dead_count + added, added)
         left = SECOND_MOMENT_LEFT_WHERE_DENSE if self.dense else SECOND_MOMENT_LEFT
         reset_moments(gaussians, optimizer, changed, left)
         return added > 0
@@ -159,11 +145,6 @@ class McmcStrategy(Strategy):
             changed = refinement.changed
         # Elsewhere, as in the authors' code, copies keep the Adam state of their row, and only their sources lose it.
         copy_rows(values, values, refinement.slot_of_row, first, last, samples=sampled, changed=changed)
-
-    def sample_add(self, refinement: Refinement, first: Tensor, last: Tensor, bound: int) -> None:
-        """Fill the slots [first, last) of new Gaussians, at most `bound`, as relocate(), sampled by opacity."""
-        weights = refinement.gaussians.opacities().masked_fill_(refinement.slot_of_row >= first, 0)
-        self.relocate(refinement, weights, first, last, bound)
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
