@@ -13,9 +13,13 @@ DARKEST, BRIGHTEST = 3, 252
 CHANNELS = ("red", "green", "blue")
 # Weight of the squared second derivative of the curve against the mean weight of a code.
 _SMOOTHNESS = 0.02
-# Residuals in stops from which a sample counts less (movement, noise), rounds of reweighting, and the RMS of residuals
-# from which photos cannot be of one still scene.
-_OUTLIER, _ROUNDS, _MISALIGNED = 0.1, 4, 0.5
+# Residuals in stops from which a sample counts less (movement, noise), rounds of reweighting, and the median residual
+# from which photos cannot be of one still scene: a curve is right if most samples agree, whatever the others do.
+_OUTLIER, _ROUNDS, _MISALIGNED = 0.1, 4, 0.2
+# Codes up to which a photo can be at its black, stops between photos in which black does not change, codes that noise
+# changes it by, and the share of these codes that must not change for the photos to have a black of their own.
+_DARK, _BLACK_STOPS, _BLACK_NOISE, _BLACK_SHARE = 64, 2.0, 2, 0.2
+_LEAST_WEIGHT = 20.0  # Sum of a photo's weights below which nothing tells whether its time is right
 # Least rise of log2 exposure from code to code, where the samples alone would let the curve fall.
 _LEAST_RISE = 1e-4
 _MOST_PIXELS, _SHOWN = 30_000, 3000
@@ -32,7 +36,8 @@ class Calibration:
         residual: weighted RMS residual in stops.
         channel_spread: RMS difference of each channel's own curve from the shared one, stops; NaN if a channel does not
             determine a curve alone.
-        photo_offsets: stops by which each photo is brighter than its time states.
+        photo_offsets: stops by which each photo is brighter than its time states; NaN if nearly all of it is black or
+            white.
         samples: [S, 2] exposures and encoded values of some samples, for a plot.
     """
 
@@ -78,38 +83,59 @@ def calibrate_codes(
     if darker[np.diff(stops[order]) > 0.1].any():
         raise InputError(name, "a photo of longer exposure is darker than one of shorter", "correct the exposure times")
     selection = slice(None) if channel is None else [CHANNELS.index(channel)]
+    blacks = np.array([_black(codes[..., index], stops) for index in range(3)])
+    usable = codes > blacks
     photo_codes = codes[..., selection].reshape(len(photos), -1)
-    curve, residuals, weights, light = _solve(photo_codes, stops, name)
-    plain = float(np.sqrt(np.square(residuals[weights > 0]).mean()))
-    if plain > _MISALIGNED:
-        raise InputError(name, f"its photos contradict each other by {plain:.2f} stops: something moved", _REMEDY)
+    curve, residuals, weights, light = _solve(
+        photo_codes, stops, usable[..., selection].reshape(photo_codes.shape), name
+    )
+    typical = float(np.median(np.abs(residuals[weights > 0])))
+    if typical > _MISALIGNED:
+        problem = f"half of its pixels contradict each other by {typical:.2f} stops or more: something moved"
+        raise InputError(name, problem, _REMEDY)
     pairs = rng.permutation(np.argwhere(weights > 0))[:_SHOWN].T
     samples = np.stack(
         [2.0 ** (light[pairs[1]] + stops[pairs[0]] - curve[255]), photo_codes[tuple(pairs)] / 255], axis=1
     )
     exposures = 2.0 ** (curve - curve[255])
     exposures[0] = 0.0
+    total = weights.sum(1)
+    offsets = np.where(total >= _LEAST_WEIGHT, (weights * residuals).sum(1) / np.maximum(total, 1e-9), np.nan)
     return Calibration(
         TabulatedResponse(name, exposures, _CODES / 255),
         float(np.sqrt((weights * residuals**2).sum() / weights.sum())),
-        tuple(_spread(codes[..., index], stops, curve) for index in range(3)),
-        tuple((weights * residuals).sum(1) / np.maximum(weights.sum(1), 1e-9)),
+        tuple(_spread(codes[..., index], stops, usable[..., index], curve) for index in range(3)),
+        tuple(offsets),
         samples,
     )
 
 
-def _spread(codes: np.ndarray, stops: np.ndarray, shared: np.ndarray) -> float:
+def _black(codes: np.ndarray, stops: np.ndarray) -> int:
+    """Return the largest code [J, S] that more light does not change, as of scanned film; 0 if there is none."""
+    darkest = int(np.argmin(stops))
+    brighter = np.flatnonzero(stops >= stops[darkest] + _BLACK_STOPS)
+    if not len(brighter):
+        return 0
+    before, after = (codes[index].astype(int) for index in (darkest, brighter[np.argmin(stops[brighter])]))
+    unchanged = np.abs(after - before) <= _BLACK_NOISE
+    dark = before <= _DARK
+    if unchanged[dark].sum() < _BLACK_SHARE * dark.sum() or not dark.any():
+        return 0
+    return int(np.quantile(before[dark & unchanged], 0.99)) + _BLACK_NOISE
+
+
+def _spread(codes: np.ndarray, stops: np.ndarray, usable: np.ndarray, shared: np.ndarray) -> float:
     """Return the RMS difference in stops of one channel's curve from the shared one, over its codes from 10 to 245."""
     try:
-        own, _, weights, _ = _solve(codes, stops, "")
+        own, _, weights, _ = _solve(codes, stops, usable, "")
     except InputError:
         return float("nan")
     present = np.bincount(codes.ravel(), weights.ravel(), 256) > 0
     return float(np.std((own - shared)[10:246][present[10:246]]))
 
 
-def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
-    """Solve for the log2 exposure of each code; radiance is eliminated, so that 256 unknowns remain.
+def _solve(codes: np.ndarray, stops: np.ndarray, usable: np.ndarray, name: str):
+    """Solve for the log2 exposure of each code by the usable samples [J, S]; radiance is eliminated: 256 unknowns.
 
     Returns:
         log2 exposures [256], residuals in stops and weights [J, S] of the samples, and log2 radiance [S].
@@ -117,7 +143,7 @@ def _solve(codes: np.ndarray, stops: np.ndarray, name: str):
     from scipy.linalg import solve
 
     hat = np.sqrt(np.minimum(_CODES - DARKEST + 1, BRIGHTEST - _CODES + 1).clip(min=0) / (0.5 * (BRIGHTEST - DARKEST)))
-    start = hat[codes]
+    start = hat[codes] * usable
     start *= (start > 0).sum(0) >= 2
     if (start > 0).any(0).sum() < 256:
         problem = "fewer than 256 pixels are well exposed in two photos"
