@@ -1,7 +1,6 @@
 """Light inside pages: JPEG, and float pictures for a dial, as text that stands in the page."""
 
 import base64
-import io
 import zlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -9,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from markupsafe import Markup
-from PIL import Image
 
 from ..model.color_models import rec709_of
 from ..scene import View
 from .html import EMPTY, data_block, join, markup
-from .images.ldr_files import as_array, quantize
+from .images.ldr_files import as_array
 from .images.tonemap import display_gain, encode_srgb
 
 if TYPE_CHECKING:
@@ -55,13 +53,6 @@ def simulated_photo(run: "RenderableScene", exposure: np.ndarray) -> np.ndarray:
     if run.color_matrix is None:
         return np.clip(run.response.encode(exposure), 0, 1)
     return encode_srgb(exposure * np.float32(display_gain(run.response)))
-
-
-def jpeg(encoded: np.ndarray, quality: int = 88) -> bytes:
-    """Encode [H, W, 3] sRGB values in [0, 1] as JPEG."""
-    buffer = io.BytesIO()
-    Image.fromarray(quantize(encoded)).save(buffer, "JPEG", quality=quality, optimize=True)
-    return buffer.getvalue()
 
 
 def img(data: bytes, alternative: str, size: tuple[int, int], **attributes: str) -> Markup:

@@ -214,12 +214,7 @@ def _camera_files(
 ) -> dict[str, str]:
     """Return the names and texts of the files that hold the cameras of a render, as far as they are pinholes.
 
-    Args:
-        run: The scene.
-        views: Names and cameras in the scene's coordinates.
-        transform: To the coordinates of files.
-        fps: Frames a second of a camera that moves.
-        moves: Whether the cameras may be frames of one that moves.
+    moves: Whether the cameras may be frames of one that moves.
     """
     pinholes = [view for view in views if view[1].is_pinhole]
     if len(pinholes) < len(views):

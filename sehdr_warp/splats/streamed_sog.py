@@ -58,8 +58,9 @@ def read_streamed_sog(path: Path) -> GaussianArrays:
     with refusing_damage(path):
         parts: dict[int, list[tuple[int, int]]] = {}
         nodes = [meta["tree"]]
-        for count, node in enumerate(_walk(nodes)):
-            if count > _MOST_NODES:
+        for node in nodes:
+            nodes += node.get("children", [])  # The loop goes on with them.
+            if len(nodes) > _MOST_NODES:
                 raise ValueError(f"more than {_MOST_NODES} nodes")
             if "lods" in node and "0" in node["lods"]:
                 part = node["lods"]["0"]
@@ -93,14 +94,6 @@ def _rows(ranges: list[tuple[int, int]], count: int) -> np.ndarray:
     if sum(number for _, number in ranges) > count:
         raise ValueError(f"more Gaussians than a chunk of {count} has")
     return np.concatenate([np.arange(first, first + number) for first, number in ranges])
-
-
-def _walk(nodes: list[dict]):
-    """Yield all nodes of a tree."""
-    while nodes:
-        node = nodes.pop()
-        nodes += node.get("children", [])
-        yield node
 
 
 def _node(means: np.ndarray, half: np.ndarray, rows: np.ndarray, chunks: list[np.ndarray]) -> dict[str, Any]:

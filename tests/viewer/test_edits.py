@@ -187,7 +187,7 @@ def test_the_button_saves_a_page_that_opens_with_the_same_view(server, tmp_path)
             assert name == f"{page.evaluate('facts.scene')}.html"
         with page_of(chromium, (tmp_path / "shared.html").as_uri(), 240, 200) as page:
             page.wait_for_selector("#stage[data-frame=full]")
-            np.testing.assert_allclose(page.evaluate("stage.seen.world_to_camera"), place, atol=1e-6)
+            np.testing.assert_allclose(page.evaluate("stage.pose.world_to_camera"), place, atol=1e-6)
 
 
 def test_undo_goes_back_one_edit_at_a_time(server):

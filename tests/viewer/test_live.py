@@ -187,7 +187,7 @@ def test_the_page_pauses_steps_and_says_the_end(tmp_path, logged):
         assert page.locator("#curves").evaluate(curves)
         page.click("#pause")
         page.locator("#pause:disabled").wait_for()
-        wait("the training has ended", "#told")
+        wait("the training has ended", "#status")
         assert page.is_disabled("#step")
 
 

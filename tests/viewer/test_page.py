@@ -33,7 +33,7 @@ def until(page, condition):
 
 def rest(page):
     """Waits until nothing is asked for any more, nor the photo that is compared with still read."""
-    until(page, "stage.dataset.frame === 'full' && !busy && (!usesPhoto() || state.photoReady === state.photo)")
+    until(page, "stage.dataset.frame === 'full' && !request.busy && (!usesPhoto() || state.photoReady === state.photo)")
 
 
 def light_of(page, run):
@@ -64,7 +64,7 @@ def test_exposure_probe_and_saved_exr_agree(chromium, serve, tmp_path):
             np.testing.assert_allclose(pixels(page, "#picture"), encode_srgb(light * 2.0**stops), atol=2.5 / 255)
         page.fill("#seconds", "1/16")
         page.press("#seconds", "Enter")
-        assert page.text_content("#stopsTold") == "\N{MINUS SIGN}3.0 EV"
+        assert page.text_content("#stopsLabel") == "\N{MINUS SIGN}3.0 EV"
         for bad in ("-3", "soon"):
             page.fill("#seconds", bad)
             page.press("#seconds", "Enter")
@@ -86,7 +86,7 @@ SLOW = "const ask_ = fetch; fetch = (...all) => new Promise(done => setTimeout(d
 
 def test_a_page_whose_scene_is_not_there_yet_says_so_and_takes_no_input(chromium, serve):
     with page_of(chromium, serve(count=2).url, script=SLOW) as page:
-        assert page.inner_text("#told") == "the scene is being read …"
+        assert page.inner_text("#status") == "the scene is being read …"
         page.keyboard.press("]")
         page.mouse.move(200, 200)
         page.mouse.down()

@@ -46,8 +46,8 @@ def test_the_page_shows_the_light_of_the_scene(run, tmp_path):
         started = time.monotonic()
         page.wait_for_selector(FULL)
         loaded = time.monotonic() - started
-        assert page.text_content("#told") == page.title() and f"{page.title()} &middot; loading<" in file.read_text()
-        camera = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
+        assert page.text_content("#status") == page.title() and f"{page.title()} &middot; loading<" in file.read_text()
+        camera = Camera.from_dict(page.evaluate("document.getElementById('stage').pose"))
         exposure = as_array(run.render(camera).hdr) * run.base_time
         error = pixels(page, "#picture") - run.response.encode(exposure)
         assert -10 * np.log10(np.mean(error**2)) > 38
@@ -59,14 +59,14 @@ def test_the_page_shows_the_light_of_the_scene(run, tmp_path):
             )
             error = pixels(page, "#picture") - encode_srgb(light * 2.0**stops)
             assert -10 * np.log10(np.mean(error**2)) > 38, stops
-        assert "EV" in page.text_content("#stopsTold") and loaded < 30  # In software, on a machine with other work
+        assert "EV" in page.text_content("#stopsLabel") and loaded < 30  # In software, on a machine with other work
         page.locator("#stage").evaluate("stage => delete stage.dataset.frame")
         page.mouse.move(100, 80)
         page.mouse.down()
         page.mouse.move(140, 90, steps=3)
         page.mouse.up()
         page.wait_for_selector(FULL)
-        assert page.evaluate("document.getElementById('stage').seen.world_to_camera") != camera.world_to_camera.tolist()
+        assert page.evaluate("document.getElementById('stage').pose.world_to_camera") != camera.world_to_camera.tolist()
 
 
 def test_refusals(run, tmp_path):
@@ -84,16 +84,16 @@ def test_a_file_without_cameras_is_a_page_that_shows_it(run, tmp_path):
     with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
         page.wait_for_selector(FULL)
         assert (pixels(page, "#picture").max(axis=2) > 0.05).mean() > 0.1
-        pose = page.evaluate("document.getElementById('stage').seen.world_to_camera")
+        pose = page.evaluate("document.getElementById('stage').pose.world_to_camera")
         page.locator("#stage").evaluate("stage => delete stage.dataset.frame")
         page.keyboard.press("d")  # Before any click
         page.wait_for_selector(FULL)
-        assert page.evaluate("document.getElementById('stage').seen.world_to_camera") != pose
+        assert page.evaluate("document.getElementById('stage').pose.world_to_camera") != pose
         page.keyboard.press("Home")
-        page.wait_for_function("pose => JSON.stringify(stage.seen.world_to_camera) === JSON.stringify(pose)", arg=pose)
+        page.wait_for_function("pose => JSON.stringify(stage.pose.world_to_camera) === JSON.stringify(pose)", arg=pose)
         for _ in range(3):
             page.keyboard.press("[")
-        assert "1.0" in page.text_content("#stopsTold")
+        assert "1.0" in page.text_content("#stopsLabel")
 
 
 def test_a_part_of_a_file_without_cameras_is_framed(tmp_path):
@@ -165,7 +165,7 @@ def test_gaussians_beyond_the_picture_are_drawn_as_ours_are(tmp_path):
     file = write_scene_page(run, tmp_path / "fog.html")
     with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
         page.wait_for_selector(FULL)
-        camera = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
+        camera = Camera.from_dict(page.evaluate("document.getElementById('stage').pose"))
         exposure = as_array(run.render(camera).hdr) * run.base_time
         error = pixels(page, "#picture") - as_array(run.response.encode(torch.as_tensor(exposure)))
         assert exposure.max() > 0.1 and -10 * np.log10(np.mean(error**2)) > 38
@@ -183,7 +183,7 @@ def test_lamps_smaller_than_a_pixel_keep_their_light(tmp_path, focal, antialiase
     file = write_scene_page(scene, tmp_path / "lamps.html")
     with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
         page.wait_for_selector(FULL)
-        page_camera = Camera.from_dict(page.evaluate("document.getElementById('stage').seen"))
+        page_camera = Camera.from_dict(page.evaluate("document.getElementById('stage').pose"))
         picture = pixels(page, "#picture")
         rendered = scene.render_ldr(page_camera).numpy()
         assert page_camera.fx == pytest.approx(300)

@@ -51,13 +51,7 @@ def film_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:
 def default_path(run: "RenderableScene", count: int, up: str | Sequence[float] | None = None) -> list[Camera]:
     """Return the path of `--cameras orbit`: around what the photos look at, or along them if they walk ahead.
 
-    Args:
-        run: The scene; its training cameras show what a path may show.
-        count: Number of cameras on the path.
-        up: As in world_transform.
-
-    Raises:
-        SehdrError: Without training cameras, or for a count outside 1 to 100 000.
+    Raises SehdrError without training cameras, or for a count outside 1 to 100 000. up: as in world_transform.
     """
     photos = training_cameras(run)
     if way := walk(photos):

@@ -90,13 +90,7 @@ def walk_path(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """Return `count` cameras along a walk, evenly spaced, with the sway of hands taken out.
 
     Their up is that of the photos around them: structure from motion bends long walks, so that none is up everywhere.
-
-    Args:
-        cameras: From walk.
-        count: Number of cameras on the path.
-
-    Raises:
-        SehdrError: Without cameras, or for a count outside 1 to 100 000.
+    Raises SehdrError without cameras, or for a count outside 1 to 100 000.
     """
     from scipy.ndimage import gaussian_filter1d
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -98,7 +98,9 @@ def export(
     check_new_file(path, cameras=cameras, overwrite=overwrite)  # Before minutes of fitting
     if cameras and not any(entry.camera.is_pinhole for entry in run.cameras):
         raise SehdrError(f"{run.path}: has no cameras, or none that is a pinhole, to write; leave --cameras out")
-    for_edits, to_file = _file_coordinates(run, path, axes, up, scale)
+    # Regions of edits are in the coordinates of `axes`, before a file with -Y up is turned over.
+    for_edits = _turned(run, path) if axes is None else world_transform(run, axes, up=up, scale=scale)
+    to_file = file_transform(for_edits, path) if axes == "upright" else for_edits
     seconds = run.base_time if exposure_time is None else float(exposure_time)
     # Colors that are converted to Rec.709 are encoded by sRGB, at the exposure that shows middle grey as the photos do.
     display_time = seconds if run.color_matrix is None else seconds * display_gain(run.response)
@@ -128,28 +130,10 @@ def export(
     return path
 
 
-class _FileCoordinates(NamedTuple):
-    """Transforms from the scene's coordinates.
-
-    Attributes:
-        for_edits: To those that the regions of edits are in: `axes`, before a file with -Y up is turned over.
-        to_file: To those of the file.
-    """
-
-    for_edits: WorldTransform
-    to_file: WorldTransform
-
-
-def _file_coordinates(
-    run: "RenderableScene", path: Path, axes: str | None, up: str | Sequence[float] | None, scale: float | None
-) -> _FileCoordinates:
-    """Return the coordinates of a file, by the arguments of export()."""
-    if axes is None:
-        turn = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) != is_y_down(path) else np.eye(3)
-        turned = WorldTransform(turn, np.zeros(3))
-        return _FileCoordinates(turned, turned)
-    requested = world_transform(run, axes, up=up, scale=scale)
-    return _FileCoordinates(requested, file_transform(requested, path) if axes == "upright" else requested)
+def _turned(run: "RenderableScene", path: Path) -> WorldTransform:
+    """Return the half turn that a file with +Y up and one with -Y up differ by; the identity between files alike."""
+    turn = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) != is_y_down(path) else np.eye(3)
+    return WorldTransform(turn, np.zeros(3))
 
 
 def _select_rows(

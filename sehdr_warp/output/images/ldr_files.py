@@ -3,6 +3,7 @@
 Reading is in scene/images/ldr_files.py.
 """
 
+import io
 import re
 from collections.abc import Sequence
 from datetime import datetime
@@ -63,6 +64,13 @@ def write_picture(path: Path | str, codes: np.ndarray, *, exif: Image.Exif | Non
             temporary.write_bytes(png16(codes, None if exif is None else exif.tobytes().removeprefix(b"Exif\0\0")))
         else:
             Image.fromarray(codes).save(temporary, exif=exif or Image.Exif(), **options)
+
+
+def jpeg(encoded: np.ndarray, quality: int = 88, **options: Any) -> bytes:
+    """Encode [H, W] or [H, W, 3] sRGB values in [0, 1] as JPEG; options are Pillow's."""
+    buffer = io.BytesIO()
+    Image.fromarray(quantize(encoded)).save(buffer, "JPEG", quality=quality, optimize=True, **options)
+    return buffer.getvalue()
 
 
 def as_array(value) -> np.ndarray:

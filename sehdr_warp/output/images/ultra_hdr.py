@@ -4,20 +4,17 @@ By the Ultra HDR Image Format 1.1 (Android): the gain map is a second JPEG behin
 Multi-Picture index (CIPA DC-007) say so. Encoders at hand tone-map the plain picture; here it is the caller's.
 """
 
-import io
 import struct
 
 import numpy as np
-from PIL import Image
 
 from ...scene.color.primaries import srgb_to_linear
-from .ldr_files import quantize
+from .ldr_files import jpeg, quantize
 
 MOST_STOPS = 5.5
 """Stops over white that are kept; brighter light is shown at that."""
 QUALITY = 95
 _OFFSET = 1 / 64  # Added to both lights before their ratio, as the format suggests
-_XMP = b"http://ns.adobe.com/xap/1.0/\0"
 _PACKET = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
     '<rdf:Description xmlns:hdrgm="http://ns.adobe.com/hdr-gain-map/1.0/" hdrgm:Version="1.0" {}</rdf:Description>'
@@ -58,23 +55,13 @@ def jpeg_with_gain_map(base: np.ndarray, gain: np.ndarray, headroom: float) -> b
     facts = {"GainMapMin": low, "GainMapMax": high, "Gamma": 1, "OffsetSDR": _OFFSET, "OffsetHDR": _OFFSET}
     facts |= {"HDRCapacityMin": 0, "HDRCapacityMax": max(headroom, 0.1), "BaseRenditionIsHDR": False}
     attributes = " ".join(f'hdrgm:{name}="{value}"' for name, value in facts.items())
-    second = _with(_jpeg((gain - low) / (high - low)), _segment(0xE1, _XMP + _PACKET.format(f"{attributes}>").encode()))
-    first = _jpeg(base)
-    xmp = _segment(0xE1, _XMP + _PACKET.format(_DIRECTORY.format(len(second))).encode())
-    size = len(first) + len(xmp) + len(_index(0, 0, 0))
-    # Offsets are counted from behind "MPF\0", of which the index is the last segment that is put in.
-    behind = _head(first) + len(xmp) + 8
-    return _with(first, xmp + _index(size, len(second), size - behind)) + second
-
-
-def _jpeg(encoded: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(quantize(encoded)).save(buffer, "JPEG", quality=QUALITY, subsampling=0, optimize=True)
-    return buffer.getvalue()
-
-
-def _segment(marker: int, data: bytes) -> bytes:
-    return struct.pack(">BBH", 0xFF, marker, len(data) + 2) + data
+    options = {"quality": QUALITY, "subsampling": 0}
+    second = jpeg((gain - low) / (high - low), xmp=_PACKET.format(f"{attributes}>").encode(), **options)
+    first = jpeg(base, xmp=_PACKET.format(_DIRECTORY.format(len(second))).encode(), **options)
+    # The index stands behind the start marker and JFIF's own segment. Offsets are counted from behind "MPF\0".
+    head = 4 + struct.unpack(">H", first[4:6])[0]
+    size = len(first) + len(_index(0, 0, 0))
+    return first[:head] + _index(size, len(second), size - head - 8) + first[head:] + second
 
 
 def _index(first: int, second: int, offset: int) -> bytes:
@@ -82,13 +69,5 @@ def _index(first: int, second: int, offset: int) -> bytes:
     entries = struct.pack(">IIIIIIII", 0x00030000, first, 0, 0, 0, second, offset, 0)
     fields = struct.pack(">HHI4s", 0xB000, 7, 4, b"0100") + struct.pack(">HHII", 0xB001, 4, 1, 2)
     fields += struct.pack(">HHII", 0xB002, 7, len(entries), 8 + 2 + 3 * 12 + 4)
-    return _segment(0xE2, b"MPF\0" + b"MM\0*" + struct.pack(">IH", 8, 3) + fields + struct.pack(">I", 0) + entries)
-
-
-def _head(jpeg: bytes) -> int:
-    """Return where segments can be inserted: behind the start marker and JFIF's own segment."""
-    return 4 + struct.unpack(">H", jpeg[4:6])[0]
-
-
-def _with(jpeg: bytes, segments: bytes) -> bytes:
-    return jpeg[: _head(jpeg)] + segments + jpeg[_head(jpeg) :]
+    index = b"MPF\0" + b"MM\0*" + struct.pack(">IH", 8, 3) + fields + struct.pack(">I", 0) + entries
+    return struct.pack(">BBH", 0xFF, 0xE2, len(index) + 2) + index

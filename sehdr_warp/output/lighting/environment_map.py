@@ -157,14 +157,8 @@ def map_header(
 ) -> dict[str, Any]:
     """Return the OpenEXR attributes of a map: where it was taken, its axes, units and colors.
 
-    Args:
-        run: From load_run, train or load_splats.
-        center: Place of the map, scene coordinates.
-        transform: From these to the coordinates that the file states.
-        axes: Their name, as in world_transform.
-        layout: "latlong" or "cube".
-        colorspace: Primaries of the pixels.
-        exposure: Seconds that radiance was multiplied by.
+    `transform` leads from the scene's coordinates to those of the file, which `axes` names; radiance was multiplied by
+    `exposure` seconds.
     """
     facts = {
         "position": json.dumps(transform.points(center.position).tolist()),
@@ -355,13 +349,8 @@ def _judge(
 ) -> None:
     """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is.
 
-    Args:
-        run: Scene, for its path.
-        point: [3] in the coordinates that `--at` takes, for messages.
-        photos: Training cameras; their spread says what is near.
-        alpha: [H, W] coverage of the map's pixels.
-        distance: [H, W] of what they show, in the scene's units.
-        weight: [H, W] solid angles.
+    `point` [3] is as `--at` takes it, for messages. The spread of the photos' cameras says what is near. `alpha`,
+    `distance` (scene units) and `weight` (solid angles) are those of the map's pixels, [H, W].
     """
     share = weight[alpha > COVERED].sum() / weight.sum()
     place = ", ".join(f"{value:.4g}" for value in point)

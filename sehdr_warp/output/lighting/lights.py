@@ -161,11 +161,6 @@ def lights_as_received(run: "RenderableScene", lights: Sequence[Light], center: 
     """Return lights with the radiance that gives, with their shapes, the light that a place receives of each.
 
     A lamp whose shade hides it from there becomes dimmer. A rectangle that faces away stays as it is.
-
-    Args:
-        run: From load_run or train.
-        lights: Its lights.
-        center: Place, and the distance within which everything is left out.
     """
     if not lights:
         return []

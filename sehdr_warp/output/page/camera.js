@@ -13,13 +13,12 @@ function turned(v, axis, angle) {  // Rodrigues
 class FlyingCamera {
   constructor(up) { this.up = unit(up); }
 
-  // Takes a camera's place (of /scene); ahead: distance of the point that an orbit turns about.
-  jump(camera, ahead) {
-    const m = camera.world_to_camera;
-    this.lens = camera, this.ahead = ahead;
+  // Takes a camera's place; an orbit turns about a point ahead, at the focus of the scene or half its size away.
+  jump(camera, {focus, size}) {
+    const m = camera.world_to_camera, ahead = focus ? dot(add(focus, centerOf(camera), -1), m[2].slice(0, 3)) : 0;
+    this.lens = camera, this.ahead = ahead > 0 ? ahead : size / 2;
     this.right = m[0].slice(0, 3), this.down = m[1].slice(0, 3), this.forward = m[2].slice(0, 3);
-    const t = m.map(row => row[3]);
-    this.position = [0, 1, 2].map(i => -(this.right[i] * t[0] + this.down[i] * t[1] + this.forward[i] * t[2]));
+    this.position = centerOf(camera);
   }
   get pivot() { return add(this.position, this.forward, this.ahead); }
   turn(axis, angle) {
@@ -42,6 +41,16 @@ class FlyingCamera {
     const about = this.pivot;
     this.ahead *= factor;
     this.position = add(about, this.forward, -this.ahead);
+  }
+  // Moves by what a pointer does to a picture: a drag by x and y, parts of its size, and a turn of the wheel.
+  drag(event, x, y) {
+    if (event.buttons & 6 || event.shiftKey) this.pan(x, y);
+    else if (event.altKey) this.look(-x, -y);
+    else this.orbit(2.5 * x, 2.5 * y);
+  }
+  wheel(event) {
+    event.preventDefault();
+    this.dolly(Math.exp(Math.sign(event.deltaY) * Math.min(60, Math.abs(event.deltaY)) / 500));
   }
   // Two fingers at two places before and after: their distance moves nearer and away, their middle pans.
   pinch(before, after, size) {
@@ -66,6 +75,23 @@ class FlyingCamera {
     return {width, height, fx: l.fx * s, fy: l.fy * s, cx: width / 2 + (l.cx - l.width / 2) * s,
             cy: height / 2 + (l.cy - l.height / 2) * s, world_to_camera: [...rows, [0, 0, 0, 1]]};
   }
+}
+
+// Returns request(draft), which calls render(draft) once the last picture is done; of requests meanwhile one remains, a
+// full one if any was.
+function requester(render) {
+  const request = async draft => {
+    request.wanted = request.wanted === null ? draft : request.wanted && draft;
+    if (request.busy) return;
+    request.busy = true;
+    while (request.wanted !== null) {
+      const next = request.wanted;
+      request.wanted = null;
+      await render(next);
+    }
+    request.busy = false;
+  };
+  return Object.assign(request, {wanted: null, busy: false});
 }
 
 // Row by row, the 4 x 4 matrix from one camera's coordinates to another's.

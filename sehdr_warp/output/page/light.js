@@ -15,7 +15,7 @@ void main() {
   gl_Position = vec4(at * 2.0 - 1.0, 0, 1);
 }`;
 
-// Looks are constants of a program, made when first used: software renderers pay for every branch there is.
+// Looks are constants of a program, compiled when first used: software renderers pay for every branch there is.
 const FRAGMENT = looks => `#version 300 es
 const int ${Object.entries(looks).map(([name, value]) => `${name} = ${value}`).join(", ")};
 precision highp float;
@@ -79,21 +79,21 @@ vec3 stops(float l) {                        // Bands of a stop about middle gre
 vec3 place(vec2 uv) {                        // Of what a pixel shows, in the camera
   return vec3((uv - lens.zw) / lens.xy, 1.0) * texture(depth, uv).r;
 }
-bool photographed(vec2 uv, out vec3 seen) {  // What the photo shows of that place
+bool photographed(vec2 uv, out vec3 photoColor) {  // What the photo shows of that place
   vec3 p = place(uv);
   vec4 q = toPhoto * vec4(p.z > 0.0 ? p : vec3((uv - lens.zw) / lens.xy, 1.0) * far, 1.0);
   vec2 on = q.xy / q.z * photoLens.xy + photoLens.zw;
-  seen = texture(photo, on).rgb;
+  photoColor = texture(photo, on).rgb;
   return q.z > 0.0 && all(greaterThan(on, vec2(0.0))) && all(lessThan(on, vec2(1.0)));
 }
 void main() {
   vec2 uv = vec2(at.x, 1.0 - at.y);
-  vec3 seen;
+  vec3 photoColor;
   vec4 light = texture(scene, uv);
   if (at.x < split && left == 1) light = texture(other, uv);
   color = vec4(shown(light.rgb), 1);
   if (at.x < split && left == 2) {
-    color.rgb = photographed(uv, seen) ? seen : vec3(0.1);
+    color.rgb = photographed(uv, photoColor) ? photoColor : vec3(0.1);
     return;
   }
   if (overlay == 1) color.rgb = stops(log2(max(dot(light.rgb, LUMINANCE) * gain * grey, 1e-9) / 0.18));
@@ -105,8 +105,8 @@ void main() {
     color.rgb = 0.5 + 0.5 * n * vec3(1, -1, -1) / max(length(n), 1e-12);
   }
   if (overlay == 5) {
-    bool inside = photographed(uv, seen);
-    vec3 off = abs(seen - response(max(light.rgb, 0.0)));
+    bool inside = photographed(uv, photoColor);
+    vec3 off = abs(photoColor - response(max(light.rgb, 0.0)));
     color.rgb = inside ? ramp(max(off.r, max(off.g, off.b)) * 4.0) : vec3(0.08);
   }
   if (overlay == 6) color.rgb = mix(vec3(dot(color.rgb, LUMINANCE)) * 0.6, vec3(1.0, 0.25, 0.15), texture(clipped, uv).r);
@@ -124,13 +124,13 @@ const QUICK = 12, PAUSE = 150;  // Milliseconds: of a draw while looks move, in 
 const software = gl => /swiftshader|llvmpipe|softpipe|software|basic render/i.test(
   gl.getParameter((gl.getExtension("WEBGL_debug_renderer_info") || {UNMASKED_RENDERER_WEBGL: gl.RENDERER}).UNMASKED_RENDERER_WEBGL));
 
-// Where WebGL is software its canvas is not the one that is seen. What an exposure changes are tables there (tables.js),
+// Where WebGL is software its canvas is not the one in the page. What an exposure changes are tables there (tables.js),
 // which take a tenth of the time; the shader draws the rest once. What takes longer than QUICK is coarser while it moves.
 // Without WebGL2 (`gl` is null) there are the tables alone.
 class LightCanvas {
   constructor(canvas) {
-    const made = document.createElement("canvas"), options = {antialias: false, preserveDrawingBuffer: true};
-    let gl = made.getContext("webgl2", options);
+    const probe = document.createElement("canvas"), options = {antialias: false, preserveDrawingBuffer: true};
+    let gl = probe.getContext("webgl2", options);
     if (!gl || software(gl)) this.paper = canvas.getContext("2d", {alpha: false});
     else gl = canvas.getContext("webgl2", options);
     this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {}, this.stale = new Set();
@@ -285,7 +285,7 @@ async function unpackLight(text) {
 
 // A dial: <div class="dial"> with a canvas, a range, an output, and for each picture a <script type="text/plain">.
 async function startDial(dial) {
-  const canvas = dial.querySelector("canvas"), range = dial.querySelector("input"), told = dial.querySelector("output");
+  const canvas = dial.querySelector("canvas"), range = dial.querySelector("input"), label = dial.querySelector("output");
   const set = dial.dataset, lights = {};
   for (const each of dial.querySelectorAll("script[data-light]")) lights[each.dataset.light] = await unpackLight(each.textContent);
   const view = new LightCanvas(canvas);
@@ -294,7 +294,7 @@ async function startDial(dial) {
   const draw = () => {
     view.draw({stops: Number(range.value)});
     const time = Number(set.time) * 2 ** Number(range.value);
-    told.textContent = `${stopsText(Number(range.value))} \u00b7 ${secondsText(time)}`;
+    label.textContent = `${stopsText(Number(range.value))} \u00b7 ${secondsText(time)}`;
   };
   const sides = dial.querySelectorAll("select"), textures = ["other", "scene"];
   sides.forEach((side, i) => side.addEventListener("change", () => { show(textures[i], side.value); draw(); }));
@@ -310,7 +310,7 @@ async function startDial(dial) {
     show("other", sides[0] ? sides[0].value : names[0]);
   }
   show("scene", sides[1] ? sides[1].value : names[0]);
-  view.draw({grey: Number(set.grey), tone: set.tone || "none", left: 1, split: names.length > 1 ? 0.5 : 0});
+  view.draw({grey: Number(set.grey), left: 1, split: names.length > 1 ? 0.5 : 0});
   range.addEventListener("input", draw);
   draw();
 }

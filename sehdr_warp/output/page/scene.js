@@ -4,7 +4,7 @@
 const $ = id => document.getElementById(id);
 const facts = JSON.parse($("facts").textContent), light = new LightCanvas($("picture")), camera = new FlyingCamera(facts.up);
 const stage = $("stage"), STILL_AFTER = 160, DRAFT_TIME = 60;
-let app, eye, material, color, target, sorted = 0, wanted = null, busy = false, timer = 0, scale = 0.5;
+let app, eye, material, color, target, sorted = 0, timer = 0, scale = 0.5;
 
 async function start() {
   if (!light.gl) throw new Error("this browser has no WebGL2, by which the scene is drawn");
@@ -101,25 +101,17 @@ function moved() {
   timer = setTimeout(() => { timer = 0, request(false); }, STILL_AFTER);
   request(true);
 }
-async function request(draft) {
-  if (!stage.clientWidth) return;
-  wanted = wanted === null ? draft : wanted && draft;
-  if (busy) return;
-  busy = true;
-  while (wanted !== null) {
-    const isDraft = wanted, started = performance.now();
-    wanted = null;
-    if (!isDraft && !sorted) break;  // A full picture waits for the first order of its Gaussians, which asks for it.
-    await render(isDraft ? scale : 1);
-    if (isDraft) scale = Math.min(1, Math.max(0.15, scale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / (performance.now() - started))))));
-    else if (wanted === null && sorted) stage.dataset.frame = "full", $("told").textContent = document.title;
-  }
-  busy = false;
-}
+const request = requester(async draft => {
+  if (!stage.clientWidth || !draft && !sorted) return;  // A full picture waits for the first order of its Gaussians, which asks for it.
+  const started = performance.now();
+  await render(draft ? scale : 1);
+  if (draft) scale = Math.min(1, Math.max(0.15, scale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / (performance.now() - started))))));
+  else if (request.wanted === null && sorted) stage.dataset.frame = "full", $("status").textContent = document.title;
+});
 async function render(part) {
   const ratio = Math.min(window.devicePixelRatio || 1, 2) * part, [width, height] = [stage.clientWidth, stage.clientHeight].map(x => Math.max(8, Math.round(x * ratio)));
   resize(width, height);
-  place(stage.seen = camera.at(width, height));
+  place(stage.pose = camera.at(width, height));
   app.renderNextFrame = true;
   await new Promise(done => app.once("frameend", done));
   const rows = await color.read(0, 0, width, height, {renderTarget: target, immediate: true}), upright = new Uint16Array(rows.length);
@@ -130,13 +122,11 @@ async function render(part) {
 }
 function paint() {
   const stops = Number($("stops").value);
-  $("stopsTold").textContent = `${stopsText(stops)} \u00b7 ${secondsText(facts.base_time * 2 ** stops)}`;
+  $("stopsLabel").textContent = `${stopsText(stops)} \u00b7 ${secondsText(facts.base_time * 2 ** stops)}`;
   if (light.frames.scene) light.draw({stops, tone: $("tone").value, grey: facts.grey});
 }
 function jump(view) {
-  const from = centerOf(view);
-  const ahead = facts.focus ? dot(add(facts.focus, from, -1), view.world_to_camera[2].slice(0, 3)) : 0;
-  camera.jump(view, ahead > 0 ? ahead : facts.size / 2);
+  camera.jump(view, facts);
   moved();
 }
 
@@ -154,13 +144,11 @@ stage.addEventListener("pointermove", event => {
   const before = [...pointers.values()];
   pointers.set(event.pointerId, [event.clientX, event.clientY]);
   if (before.length === 2) camera.pinch(before, [...pointers.values()], size);
-  else if (event.buttons & 6 || event.shiftKey) camera.pan(x, y);
-  else if (event.altKey) camera.look(-x, -y);
-  else camera.orbit(2.5 * x, 2.5 * y);
+  else camera.drag(event, x, y);
   moved();
 });
 stage.addEventListener("contextmenu", event => event.preventDefault());
-stage.addEventListener("wheel", event => { event.preventDefault(); camera.dolly(Math.exp(Math.sign(event.deltaY) * Math.min(60, Math.abs(event.deltaY)) / 500)); moved(); }, {passive: false});
+stage.addEventListener("wheel", event => { camera.wheel(event); moved(); }, {passive: false});
 document.addEventListener("keydown", event => {
   if (event.target.matches("input, select") || event.ctrlKey || event.metaKey) return;
   const pace = facts.size * 0.03, step = {w: [0, 0, pace], s: [0, 0, -pace], a: [-pace, 0, 0], d: [pace, 0, 0], e: [0, pace, 0], q: [0, -pace, 0]}[event.key.toLowerCase()];
@@ -168,4 +156,4 @@ document.addEventListener("keydown", event => {
   if (event.key === "[" || event.key === "]") { $("stops").value = (Math.round(3 * Number($("stops").value)) + (event.key === "]" ? 1 : -1)) / 3; paint(); }
   if (event.key === "Home") { $("view").value = ""; jump(opening()); }
 });
-start().catch(error => { $("told").textContent = error.message; });
+start().catch(error => { $("status").textContent = error.message; });

@@ -14,9 +14,10 @@ from ...scene.camera import limited_size
 from ...scene.exposure.times import shutter
 from ...scene.images.downsampling import area_average
 from ..html import EMPTY, duration, join, markup, page_file, whole_page, with_code
+from ..images.ldr_files import jpeg
 from ..images.tonemap import expose, fit_tone_map
 from ..images.ultra_hdr import MOST_STOPS, ultra_hdr
-from ..light_pictures import SPLIT, dial, img, jpeg, jpeg_source, photo_for_display, side_choices, simulated_photo
+from ..light_pictures import SPLIT, dial, img, jpeg_source, photo_for_display, side_choices, simulated_photo
 from ..lighting.lights import uncertain_lights
 from ..lighting.unit import luminance_of_one, read_light_unit
 from ..world_transform import WorldTransform, world_transform

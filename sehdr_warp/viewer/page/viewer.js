@@ -5,11 +5,11 @@ const $ = id => document.getElementById(id);
 const stage = $("stage"), picture = $("picture"), drawing = $("drawing");
 const DRAFT_TIME = 90, STILL_AFTER = [140, 600];  // Milliseconds that a picture may take while moving; then comes the full one
 let runs, light, camera, facts, state = {stops: 0, photo: 0, split: 0.5, pointer: null, keys: new Set(), path: []};
-let draftScale = 0.5, fullTime = 0, busy = false, wanted = null, stillTimer = 0, drawn = null, playing = 0;
+let draftScale = 0.5, fullTime = 0, stillTimer = 0, drawn = null, playing = 0;
 
 async function ask(path, body) {
-  const given = body && {method: "POST", headers: {"Content-Type": "application/json"}, body: JSON.stringify(body)};
-  const answer = await fetch(path, given).catch(() => { throw new Error(over()); });
+  const options = body && {method: "POST", headers: {"Content-Type": "application/json"}, body: JSON.stringify(body)};
+  const answer = await fetch(path, options).catch(() => { throw new Error(over()); });
   if (!answer.ok) throw new Error(await answer.text());
   return answer;
 }
@@ -17,8 +17,8 @@ async function ask(path, body) {
 const over = () => $("training").hidden ? "the server is gone" : "the training has ended; `sehdr-warp view` shows the run";
 
 async function start() {
-  const told = await (await ask("scene")).json();
-  runs = told.runs, facts = runs[0], light = new LightCanvas(picture);
+  const answer = await (await ask("scene")).json();
+  runs = answer.runs, facts = runs[0], light = new LightCanvas(picture);
   for (const option of light.gl ? [] : document.querySelectorAll("[data-shaded]")) {
     option.disabled = true;
     option.textContent += " (needs WebGL2)";
@@ -33,8 +33,8 @@ async function start() {
     $("merge").add(new Option(label(run), i));
   });
   $("runRow").hidden = $("mergeRow").hidden = runs.length < 2;
-  $("edit").hidden = $("lights").hidden = $("share").hidden = told.training;
-  if (told.training) startTraining();
+  $("edit").hidden = $("lights").hidden = $("share").hidden = answer.training;
+  if (answer.training) startTraining();
   else setInterval(renew, 2000);
   useRun(0);
   new ResizeObserver(resize).observe(stage);
@@ -48,8 +48,8 @@ function label(run) {
 }
 const home = () => jump(facts.opening && facts.views.length ? nearestView(facts.opening) : facts.first, facts.opening);
 // The photo that was taken nearest to a camera, in about its direction.
-function nearestView(seen) {
-  const center = centerOf(seen), forward = seen.world_to_camera[2].slice(0, 3);
+function nearestView(pose) {
+  const center = centerOf(pose), forward = pose.world_to_camera[2].slice(0, 3);
   const distances = facts.views.map(view => Math.hypot(...add(centerOf(view.camera), center, -1)) / facts.size
     + 1 - dot(view.camera.world_to_camera[2].slice(0, 3), forward));
   return distances.indexOf(Math.min(...distances));
@@ -61,9 +61,9 @@ async function renew() {
   try {
     const versions = await (await ask("versions")).json();
     if (versions.every((version, i) => version === runs[i].version)) return;
-    const told = await (await ask("scene")).json(), views = all => JSON.stringify(all.map(run => run.views));
-    if (views(told.runs) !== views(runs)) return location.reload();  // Another scene
-    runs = told.runs;
+    const answer = await (await ask("scene")).json(), views = all => JSON.stringify(all.map(run => run.views));
+    if (views(answer.runs) !== views(runs)) return location.reload();  // Another scene
+    runs = answer.runs;
     useRun(state.run);
     request(false);
   } catch (error) { tell(error.message); }
@@ -96,11 +96,10 @@ function resize() {
 // Takes the place of a photo, or another one near it.
 function jump(index, place) {
   const view = facts.views[index];
-  if (!view && !place) { camera.jump({width: 4, height: 3, fx: 3, fy: 3, cx: 2, cy: 1.5, world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, 1); return moved(); }
+  if (!view && !place) { camera.jump({width: 4, height: 3, fx: 3, fy: 3, cx: 2, cy: 1.5, world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, {size: 2}); return moved(); }
   $("zoom").value = 0;
   if (view) $("view").value = index;
-  const seen = place || view.camera, ahead = facts.focus ? dot(add(facts.focus, centerOf(seen), -1), seen.world_to_camera[2].slice(0, 3)) : 0;
-  camera.jump(seen, ahead > 0 ? ahead : facts.size / 2);
+  camera.jump(place || view.camera, facts);
   if (view) loadPhoto(index);
   moved();
 }
@@ -115,7 +114,7 @@ async function loadPhoto(index) {
     if (state.photo !== index) return;
     light.putPhoto(image);
     state.photoReady = index;
-    tell(state.told);
+    tell(state.status);
     paint();
   } catch (error) { tell(error.message); }
 }
@@ -134,23 +133,14 @@ function moved() {
   stillTimer = setTimeout(() => request(false), Math.min(STILL_AFTER[1], Math.max(STILL_AFTER[0], fullTime / 4)));
   request(true);
 }
-async function request(draft) {
-  if (!drawing.width) return;
-  wanted = wanted === null ? draft : wanted && draft;
-  if (busy) return;
-  busy = true;
-  while (wanted !== null) {
-    const isDraft = wanted;
-    wanted = null;
-    try { await load(isDraft); } catch (error) { tell(error.message); await new Promise(done => setTimeout(done, 500)); }
-  }
-  busy = false;
-}
+const request = requester(async draft => {
+  try { if (drawing.width) await load(draft); } catch (error) { tell(error.message); await new Promise(done => setTimeout(done, 500)); }
+});
 async function load(draft) {
   const scale = draft ? draftScale : 1, width = Math.max(16, Math.round(drawing.width * scale)), height = Math.max(16, Math.round(drawing.height * scale));
-  const seen = camera.at(width, height, zoom()), started = performance.now(), clipped = $("overlay").value === "clipped";
+  const pose = camera.at(width, height, zoom()), started = performance.now(), clipped = $("overlay").value === "clipped";
   const left = $("left").value, other = left.startsWith("run") ? Number(left.slice(3)) : null;
-  const fetched = async (run, clip) => new Uint16Array(await (await ask("frame", {run, camera: seen, draft, clipped: clip})).arrayBuffer());
+  const fetched = async (run, clip) => new Uint16Array(await (await ask("frame", {run, camera: pose, draft, clipped: clip})).arrayBuffer());
   const [half, second] = await Promise.all([fetched(state.run, clipped), other === null ? null : fetched(other, false)]);
   const n = width * height, took = performance.now() - started;
   picture.width = width, picture.height = height;  // Shaded at the frame's size: the browser enlarges drafts.
@@ -160,21 +150,21 @@ async function load(draft) {
   if (second) light.put("other", width, height, second.subarray(0, 4 * n), 4);
   if (draft && $("training").hidden) draftScale = Math.min(1, Math.max(0.08, draftScale * Math.min(1.5, Math.max(0.5, Math.sqrt(DRAFT_TIME / took)))));
   if (!draft) fullTime = took;
-  drawn = {camera: seen, draft};
+  drawn = {camera: pose, draft};
   const depths = Uint16Array.from({length: Math.floor(n / 13)}, (_, i) => half[4 * n + 13 * i]).filter(d => d > 0).sort();  // As integers
   const [near, far] = [0.02, 0.98].map(part => fromHalf(depths[Math.floor(part * depths.length)] || 0x3c00));
   Object.assign(light.settings, {near, far});
   legend();
-  tell(state.told = `${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${counts(facts.gaussians)} Gaussians`
+  tell(state.status = `${width} \u00d7 ${height} \u00b7 ${took.toFixed(0)} ms \u00b7 ${counts(facts.gaussians)} Gaussians`
     + (facts.iterations && $("training").hidden ? ` \u00b7 ${facts.iterations} steps` : ""));
   if (!draft) nearestPhoto();
   histogram();
   frusta();
   paint();
-  if (!draft && wanted === null) stage.dataset.frame = "full";  // Nothing better is to come
+  if (!draft && request.wanted === null) stage.dataset.frame = "full";  // Nothing better is to come
 }
 const counts = number => number.toLocaleString("en").replaceAll(",", "\u202f");
-const tell = text => { $("told").textContent = text; };
+const tell = text => { $("status").textContent = text; };
 const zoom = () => 2 ** Number($("zoom").value);
 
 function paint() {
@@ -184,7 +174,7 @@ function paint() {
   const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera)} : {};
   light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value === "error" && !ready ? "none" : $("overlay").value,
               split, left: left === "photo" ? 2 : left === "0" ? 0 : 1, lens: lensOf(drawn.camera), ...photo});
-  $("whiteTold").textContent = stopsText(Number($("white").value));
+  $("whiteLabel").textContent = stopsText(Number($("white").value));
   $("handle").hidden = left === "0";
   $("handle").style.left = 100 * state.split + "%";
   [left === "photo" ? view.name : left.startsWith("run") ? label(runs[Number(left.slice(3))]) : "", runs.length > 1 ? label(facts) : "scene"]
@@ -194,7 +184,7 @@ function paint() {
 
 function expose() {
   $("stops").value = state.stops;
-  $("stopsTold").textContent = stopsText(state.stops);
+  $("stopsLabel").textContent = stopsText(state.stops);
   if (document.activeElement !== $("seconds")) $("seconds").value = secondsText(facts.base_time * 2 ** state.stops);
   bars();
   paint();
@@ -336,9 +326,7 @@ picture.addEventListener("pointermove", event => {
   if (state.drag && event.buttons) {
     const x = event.clientX - state.drag[0], y = event.clientY - state.drag[1], size = Math.min(stage.clientWidth, stage.clientHeight);
     state.drag = [event.clientX, event.clientY, state.drag[2] + Math.abs(x) + Math.abs(y)];
-    if (event.buttons & 2 || event.buttons & 4 || event.shiftKey) camera.pan(x / size, y / size);
-    else if (event.altKey) camera.look(-x / size, -y / size);
-    else camera.orbit(2.5 * x / size, 2.5 * y / size);
+    camera.drag(event, x / size, y / size);
     if (x || y) moved();
   }
   probe();
@@ -352,7 +340,7 @@ picture.addEventListener("pointerup", event => {
 });
 picture.addEventListener("pointerleave", () => { state.pointer = null; probe(); });
 picture.addEventListener("contextmenu", event => event.preventDefault());
-picture.addEventListener("wheel", event => { event.preventDefault(); camera.dolly(Math.exp(Math.sign(event.deltaY) * Math.min(60, Math.abs(event.deltaY)) / 500)); moved(); }, {passive: false});
+picture.addEventListener("wheel", event => { camera.wheel(event); moved(); }, {passive: false});
 picture.addEventListener("dblclick", event => {
   const target = pointAt(inside(event));
   if (state.picking || !target) return;
@@ -496,9 +484,9 @@ function edit() {
 measured();
 
 // Lights: a list to fly to, with a gain for each
-function listLights(told) {
-  const unit = told && told.unit, value = x => unit ? `${figure(unit * x)} cd/m\u00b2` : figure(x);
-  $("lightList").replaceChildren(...(told ? told.lights : []).map((lamp, i) => {
+function listLights(list) {
+  const unit = list && list.unit, value = x => unit ? `${figure(unit * x)} cd/m\u00b2` : figure(x);
+  $("lightList").replaceChildren(...(list ? list.lights : []).map((lamp, i) => {
     const make = (kind, values = {}) => Object.assign(document.createElement(kind), values), row = make("div", {className: "light"});
     const name = `${lamp.name}: ${(100 * lamp.share).toFixed(lamp.share < 0.1 ? 1 : 0)} % of the light`;
     const sure = lamp.deviation === null ? "" : ` \u00b1 ${lamp.deviation.toFixed(1)} stops`, button = make("button", {textContent: name, title: "fly there"});
@@ -511,7 +499,7 @@ function listLights(told) {
     range.addEventListener("change", () => gain(i, Number(range.value)));
     return row;
   }));
-  $("lightNote").textContent = told && !told.lights.length ? "the photos clip no light" : "";
+  $("lightNote").textContent = list && !list.lights.length ? "the photos clip no light" : "";
 }
 // From the side of the photos: five times its size away from a large light, at three tenths of the distance from a small one.
 function flyTo(lamp) {
@@ -544,17 +532,17 @@ function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 const answer = text => { $("saved").textContent = text, $("saved").scrollIntoView({block: "nearest"}); };
-const counted = () => Math.max(2, Math.round(24 * (Number($("length").value) || 6)));
+const frameCount = () => Math.max(2, Math.round(24 * (Number($("length").value) || 6)));
 for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", async () => {
   const kind = button.dataset.save, film = kind === "film";
   if (film && state.path.length < 2) return answer("add two views or more first");
   answer(kind === "page" ? "fitting colors for the page, up to a minute \u2026" : "rendering \u2026");
   let watch = film && setInterval(async () => {
-    const told = await ask("saving").then(said => said.text(), () => "");
-    if (told && watch) answer(told);
+    const line = await ask("saving").then(reply => reply.text(), () => "");
+    if (line && watch) answer(line);
   }, 1000);
   try {
-    const body = {run: state.run, kind, evs: $("evs").value, cameras: film ? state.path : [now()], count: film ? counted() : null, stops: state.stops};
+    const body = {run: state.run, kind, evs: $("evs").value, cameras: film ? state.path : [now()], count: film ? frameCount() : null, stops: state.stops};
     download(await (await ask("save", body)).blob(), facts.scene + {exr: ".exr", brackets: "_brackets.zip", film: ".mp4", page: ".html"}[kind]);
     answer("saved by your browser");
   } catch (error) { answer(error.message); }
@@ -562,7 +550,7 @@ for (const button of document.querySelectorAll("[data-save]")) button.addEventLi
 });
 $("addView").addEventListener("click", () => { state.path.push(now()); answer(`${state.path.length} views in the path`); });
 $("clearPath").addEventListener("click", () => { state.path = []; playing = 0; answer(""); });
-const path = async () => (await (await ask("path", {cameras: state.path, count: counted()})).json()).cameras;
+const path = async () => (await (await ask("path", {cameras: state.path, count: frameCount()})).json()).cameras;
 $("savePath").addEventListener("click", async () => {
   if (!state.path.length) return answer("add a view first");
   download(new Blob([JSON.stringify({cameras: await path()})], {type: "application/json"}), "path.json");
@@ -573,7 +561,7 @@ $("play").addEventListener("click", async () => {
   const cameras = await path(), turn = ++playing, started = performance.now(), step = async () => {
     const index = Math.floor((performance.now() - started) / 1000 * 24);
     if (turn !== playing) return;
-    camera.jump(cameras[Math.min(index, cameras.length - 1)], camera.ahead);
+    camera.jump(cameras[Math.min(index, cameras.length - 1)], {size: 2 * camera.ahead});
     $("zoom").value = 0;
     if (index >= cameras.length) return moved();
     await request(true);
