@@ -77,7 +77,7 @@ def test_parts_of_panoramas_are_refused(tmp_path, size, cropped, expected):
 
 def test_bare_panoramas_are_placed(tmp_path):
     (tmp_path / "set").mkdir()
-    cameras = photos(tmp_path / "set", 4)
+    cameras = photos(tmp_path / "set", 4, 384)
     scene = load_scene(tmp_path / "set", response="srgb", cache=tmp_path / "cache", holdout=0, max_size=128)
     assert len(scene.views) == 4 and len(scene.points) > 100
     assert all(view.camera.projection == "equirectangular" for view in scene.views)

@@ -1,6 +1,7 @@
 """Structure from motion: what its cache depends on, and how it places bare photos of all kinds."""
 
 import shutil
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from PIL import Image
 from sehdr_warp.scene.color.primaries import linear_to_srgb, srgb_to_linear
 from sehdr_warp.scene.dataparser import PointCloud
 from sehdr_warp.scene.lens import Lens
+from sehdr_warp.scene.load import parse_dataset
 from sehdr_warp.scene.photos import brightened_codes
 from sehdr_warp.scene.readers import bare_photos
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
@@ -44,6 +46,7 @@ def key(monkeypatch, tmp_path):
         return str(stopped.value)
 
     monkeypatch.setattr(sfm, "solved_folder", stop)
+    monkeypatch.setattr(sfm, "packages_distributions", cache(sfm.packages_distributions))  # It reads every package.
     return compute
 
 
@@ -59,19 +62,15 @@ def test_a_killed_process_leaves_no_copies_of_photos_in_the_cache(tmp_path):
     assert places[0][0].parent == places[0][1] and [file.name for file in folder.iterdir() if file.is_dir()] == []
 
 
-@pytest.mark.parametrize("name", sorted(CONSTANTS))
-def test_a_constant_that_changes_the_result_finds_cameras_anew(name, key, monkeypatch):
-    before = key()
-    assert key() == before
-    monkeypatch.setattr(sfm, name, getattr(sfm, name) + 1)
-    assert key() != before
-
-
-@pytest.mark.parametrize("field", sfm.BRIGHTENING._fields)
-def test_another_brightening_finds_cameras_anew(field, key, monkeypatch):
+def test_a_constant_that_changes_the_result_finds_cameras_anew(key, monkeypatch):
     before, brightening = key(), sfm.BRIGHTENING
-    monkeypatch.setattr(sfm, "BRIGHTENING", brightening._replace(**{field: 0.1}))
-    assert key() != before
+    values = {name: getattr(sfm, name) + 1 for name in CONSTANTS}
+    changes = [*values.items(), *(("BRIGHTENING", brightening._replace(**{field: 0.1})) for field in brightening._fields)]
+    for name, value in changes:
+        with monkeypatch.context() as patch:
+            patch.setattr(sfm, name, value)
+            assert key() != before, (name, value)
+    assert key() == before
 
 
 def test_photos_masks_and_another_pycolmap_find_cameras_anew(key, monkeypatch, tmp_path):
@@ -107,7 +106,7 @@ LOST = image_name(2)
 
 
 def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, shared, caplog):
-    """Five of the castle's photos at a fifth of their size: all placed, EXIF times kept, the second call reuses."""
+    """Five of the castle's photos at a quarter of their size: all placed, EXIF times kept, the second call reuses."""
     photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
     for photo in photos:
         with Image.open(photo) as image:
@@ -157,9 +156,9 @@ def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
     photos = sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]
     for i, photo in enumerate(photos):
         with Image.open(photo) as image:
-            image.reduce(4 if i < 3 else 5).save(tmp_path / photo.name, quality=95)
+            image.reduce(5 if i < 3 else 6).save(tmp_path / photo.name, quality=95)
     reconstruction = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
-    assert {(image.lens.width, image.lens.height) for image in reconstruction.model.images} == {(567, 426), (708, 532)}
+    assert {(image.lens.width, image.lens.height) for image in reconstruction.model.images} == {(472, 355), (567, 426)}
     assert 0 < reconstruction.error < MOST_ERROR and not reconstruction.notes(photos)
 
 
@@ -184,17 +183,20 @@ def test_codes_of_bright_photos_stay_and_those_of_dark_ones_reach_a_midtone():
 
 
 def test_an_object_that_turns_is_placed_by_its_masks(tmp_path, shared):
-    known = {view.name: view.camera for view in load(shared / "data" / "tankard_turntable", max_size=100).views}
+    tankard = shared / "data" / "tankard_turntable"
+    known = {record.image.stem: record.world_to_camera for record in parse_dataset(tankard).records}
     for kind, suffix in (("images", "jpg"), ("masks", "png")):
         (tmp_path / kind).mkdir()
         for index in range(9669, 9677):
-            shutil.copy(shared / "data" / "tankard_turntable" / kind / f"IMG_{index}.{suffix}", tmp_path / kind)
+            with Image.open(tankard / kind / f"IMG_{index}.{suffix}") as image:
+                small = image.convert("L" if kind == "masks" else "RGB").reduce(2)
+            small.save(tmp_path / kind / f"IMG_{index}.png")
     views = load(tmp_path, max_size=100).views
-    turns = [(view.camera.world_to_camera[:3, :3], known[view.name].world_to_camera[:3, :3]) for view in views]
+    turns = [(view.camera.world_to_camera[:3, :3], known[view.name][:3, :3]) for view in views]
     assert len(views) >= 6
     for (a, true_a), (b, true_b) in pairwise(turns):
         difference = (b @ a.T) @ (true_b @ true_a.T).T
-        assert np.degrees(np.arccos(np.clip((np.trace(difference) - 1) / 2, -1, 1))) < 1
+        assert np.degrees(np.arccos(np.clip((np.trace(difference) - 1) / 2, -1, 1))) < 2
 
 
 def test_masks_that_keep_too_little_are_not_used_for_placing(tmp_path, shared, caplog):
@@ -248,10 +250,9 @@ def test_masks_count_if_whole_photos_place_no_more_than_they(monkeypatch, caplog
 def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypatch, caplog):
     """And a photo that none is likely for is matched with all others before the second try."""
     monkeypatch.setattr(sfm, "EXHAUSTIVE_LIMIT", 3)
-    photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
-    for photo in photos:
+    for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]:
         with Image.open(photo) as image:
-            image.reduce(4).save(tmp_path / photo.name, quality=95)
+            image.reduce(6).save(tmp_path / photo.name, quality=95)
     photos = sorted(tmp_path.glob("*.JPG"))
     caplog.set_level("INFO", "sehdr_warp.scene")
     assert len(reconstruct(photos, tmp_path / "cache").model.images) == 5
