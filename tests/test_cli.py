@@ -96,20 +96,20 @@ def test_every_command_explains_itself(name, capsys):
     assert f"sehdr-warp {name}" in text and "None" not in text
 
 
+HEAVY = ("torch", "warp", "scipy", "matplotlib", "colour", "pycolmap", "OpenEXR")
+"""Modules that take from a tenth of a second to seconds to import."""
+
+
 @pytest.mark.parametrize(
-    "words, most", [("train --help", 1.5), ("--help", 1.0), ("completion bash", 2.0), ("responses", 1.0)]
+    "words, most", [("train --help", 800), ("--help", 200), ("completion bash", 800), ("responses", 700)]
 )
 def test_help_is_quick_and_needs_no_torch(words, most):
-    """Seconds of processor time, in one of three tries: how long that takes is a matter of what else runs."""
-    code = f"import sys, time; from sehdr_warp import cli\ntry: cli.main({words.split()})\n"
-    code += "except SystemExit: print('torch' in sys.modules, time.process_time())"
-    for _ in range(3):
-        out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-        torch, seconds = out.split()[-2:]
-        assert torch == "False"
-        if float(seconds) < most:
-            return
-    pytest.fail(f"{seconds} s")
+    """By what is imported, because seconds depend on the machine: it takes some 0.7, 0.1, 1.3 and 0.4."""
+    code = f"import sys; from sehdr_warp import cli\ntry: cli.main({words.split()})\n"
+    code += f"except SystemExit: print(len(sys.modules), *({{*{HEAVY}}} & {{*sys.modules}}))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    count, *heavy = out.splitlines()[-1].split()
+    assert not heavy and int(count) < most
 
 
 @pytest.mark.parametrize("line", ["report run --out", "eval pictures --truth embedded --json"])

@@ -65,7 +65,10 @@ def test_a_killed_process_leaves_no_copies_of_photos_in_the_cache(tmp_path):
 def test_a_constant_that_changes_the_result_finds_cameras_anew(key, monkeypatch):
     before, brightening = key(), sfm.BRIGHTENING
     values = {name: getattr(sfm, name) + 1 for name in CONSTANTS}
-    changes = [*values.items(), *(("BRIGHTENING", brightening._replace(**{field: 0.1})) for field in brightening._fields)]
+    changes = [
+        *values.items(),
+        *(("BRIGHTENING", brightening._replace(**{field: 0.1})) for field in brightening._fields),
+    ]
     for name, value in changes:
         with monkeypatch.context() as patch:
             patch.setattr(sfm, name, value)
