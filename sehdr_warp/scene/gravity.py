@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +34,9 @@ _LEAST_PEAK = 3.0  # Times that lines agree better on the vertical than on other
 # Angles by which lines may raise the typical roll of cameras that turn, and of those that look one way and may be
 # rolled alike.
 _MORE_ROLL, _MORE_ROLL_ALIKE = math.radians(2.0), math.radians(8.0)
+
+# EXIF's orientations, with the direction in stored pixels (column, row, depth) that is down in the upright picture.
+_DOWNWARDS = {3: (0, -1, 0), 4: (0, -1, 0), 5: (1, 0, 0), 6: (1, 0, 0), 7: (-1, 0, 0), 8: (-1, 0, 0)}
 
 _GPS_IFD, _EARTH = 0x8825, 6_371_000.0  # EXIF's table of GPS; mean radius in meters
 _GPS_PHOTOS = 4  # Fewest that state a place
@@ -69,13 +73,23 @@ class UpDirection(NamedTuple):
 def find_up(scene: Scene) -> UpDirection:
     """Return the up direction of a scene: by GPS if its places fit, else by vertical lines, else by the poses alone."""
     views = [view for view in scene.train_views if view.camera.is_pinhole] or list(scene.train_views)
-    cameras = [view.camera for view in views]
+    cameras = [upright_camera(view) for view in views]
     by_gps = _up_from_gps(views)
     if by_gps is not None:
         return by_gps
     up = up_direction(cameras)
     by_lines = up_from_lines(views, up) if cameras[0].is_pinhole and not looks_down(cameras, up) else None
     return UpDirection(up, "cameras") if by_lines is None else UpDirection(by_lines, "lines")
+
+
+def upright_camera(view: View) -> Camera:
+    """Return the camera of a view, turned around its axis so that what its photo shows stands upright."""
+    down = _DOWNWARDS.get(view.orientation)
+    if down is None or not view.camera.is_pinhole:
+        return view.camera
+    turn = np.eye(4)
+    turn[:3, :3] = [np.cross(down, (0, 0, 1)), down, (0, 0, 1)]
+    return replace(view.camera, world_to_camera=turn @ view.camera.world_to_camera)
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
@@ -144,7 +158,7 @@ def up_from_lines(views: Sequence[View], up: np.ndarray) -> np.ndarray | None:
     normals, weights = (np.concatenate(each) for each in zip(*parts, strict=True))
     near = np.abs(normals @ up) < math.sin(math.radians(_CONE))
     normals, weights = normals[near], weights[near] / len(chosen)
-    cameras = [view.camera for view in views]
+    cameras = [upright_camera(view) for view in views]
     level = _level_axes(_rotations(cameras), up)
 
     def search(center: np.ndarray, radius: float, step: float, width: float, skip: int = 1) -> tuple[np.ndarray, float]:

@@ -19,7 +19,15 @@ from .file_names import MASK_FOLDERS
 from .float_photos import tone_mapped
 from .images.hdr_files import hdr_size, pixel_aspect
 from .images.heif import avif_bits
-from .images.ldr_files import EncodedImage, file_kind, image_sizes, open_image, read_ldr, require_file
+from .images.ldr_files import (
+    EncodedImage,
+    file_kind,
+    image_sizes,
+    open_image,
+    orientation_of,
+    read_ldr,
+    require_file,
+)
 from .lens import Lens
 from .raw.decode import read_header, read_raw
 
@@ -181,6 +189,14 @@ def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
         return read_header(path)[:2]
     size = hdr_size(path)
     return size, size
+
+
+def stored_orientation(path: Path) -> int:
+    """Return EXIF's orientation of a photo's stored pixels; 1 without one, and for RAW and float pictures."""
+    if file_kind(path) != "encoded":
+        return 1
+    with open_image(path) as image:
+        return orientation_of(image)
 
 
 def read_photo(path: Path, *, oriented: bool = False) -> EncodedImage:

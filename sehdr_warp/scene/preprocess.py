@@ -28,7 +28,7 @@ from .lens import Lens, Undistortion
 from .masks import mask_note, read_mask
 from .photo_content import ContentCheck, unused_bits_note
 from .photo_storage import PhotoKeeper
-from .photos import fitted_lens, read_photo, unusable_notes
+from .photos import fitted_lens, read_photo, stored_orientation, unusable_notes
 from .raw.decode import linear_codes
 from .types import Scene, View, codes_of
 from .video.color import codes_in_rec709
@@ -220,7 +220,20 @@ class _Preprocessor:
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         above = {"light_above_white": photo.above_white, "light_above_white_deviation": photo.above_white_deviation}
-        return View(name, photo.pixels, camera, time, split, mask, hdr, record.image, **above, lens=record.lens)
+        orientation = 1 if oriented else stored_orientation(record.image)
+        return View(
+            name,
+            photo.pixels,
+            camera,
+            time,
+            split,
+            mask,
+            hdr,
+            record.image,
+            **above,
+            lens=record.lens,
+            orientation=orientation,
+        )
 
     def _truth(self, record: ImageRecord, lens: Lens, resample: _Resampler) -> np.ndarray | None:
         """Return the truth of a photo at the size of its view; None without a file, or with one that cannot be used."""

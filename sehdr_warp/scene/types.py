@@ -32,6 +32,7 @@ class View:
             where it is known, 0 elsewhere. None if the file states none.
         light_above_white_deviation: standard deviation of the natural logarithm of light_above_white.
         lens: of the photo, before it was undistorted; None for a view built in code.
+        orientation: EXIF's, by which the pixels would have to be turned to stand upright; 1 if they do.
 
     Raises:
         ValueError: if codes have another type or shape; codes_of returns codes for encoded values.
@@ -48,6 +49,7 @@ class View:
     light_above_white: np.ndarray | None = None
     light_above_white_deviation: float = 0.0
     lens: "Lens | None" = None
+    orientation: int = 1
 
     def __post_init__(self):
         """Check the types and shapes."""

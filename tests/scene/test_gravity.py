@@ -1,5 +1,6 @@
 """Up by GPS, by vertical lines and by poses: of rendered rooms, whose Z is up, and of flights with places in EXIF."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -131,3 +132,22 @@ def test_photos_without_lines_leave_the_up_of_their_poses():
         views.append(View(str(index), codes, view.camera.resized(80, 60), 1.0, "train"))
     up = find_up(scene(views))
     assert up.source == "cameras" and up.direction == pytest.approx(up_direction([view.camera for view in views]))
+
+
+def test_phone_photos_stored_on_their_side_stand_upright(tmp_path):
+    """Structure from motion that reads pixels as stored; EXIF says how the photos were held."""
+    views = load_scene("embedded:study", response="srgb", max_size=96).train_views
+    frames = []
+    for view in views:
+        camera, exif = view.camera, Image.Exif()
+        exif[0x0112] = 6  # The stored picture is turned a quarter to the left.
+        Image.fromarray(np.rot90(view.codes)).save(tmp_path / f"{view.name}.jpg", exif=exif, quality=95)
+        to_stored = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        pose = np.linalg.inv(to_stored @ camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{view.name}.jpg", "transform_matrix": pose.tolist()})
+    lens = {"fl_x": camera.fy, "fl_y": camera.fx, "cx": camera.cy, "cy": camera.width - camera.cx}
+    size = {"w": camera.height, "h": camera.width}
+    (tmp_path / "transforms.json").write_text(json.dumps(lens | size | {"frames": frames}))
+    scene = load_scene(tmp_path, response="srgb")
+    assert degrees(up_direction([view.camera for view in scene.views])) > 80
+    assert degrees(find_up(scene).direction) < 2
