@@ -24,12 +24,8 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
-
-from pydantic import BaseModel
 
 from ..errors import InputError, SehdrError
 from ..files import UnreadableError, has_file, refuse_links
@@ -65,7 +61,6 @@ _MAKE_AGAIN = "remove this file; `sehdr-warp report` makes it again from the pho
 EVIDENCE_TENSORS = {"weight_sum": "seen"} | {name: name for name in ("stops", "clipped", "peak", "clipped_stops")}
 """Name in confidence.safetensors of each field of Evidence."""
 _MOST_STOPS = 2.5 * MAX_STOPS  # A misfit and a deviation, each at most MAX_STOPS, and rounding
-_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
@@ -146,14 +141,10 @@ class RunFolder:
             raise UnreadableError(self.checkpoints, error) from None
         return [self.checkpoints / name for name in names]
 
-    def _read(self, path: Path, read: Callable[[Path], _Value]) -> _Value:
-        """Return what `read` makes of a file of the run, which must not be a link."""
-        refuse_links(path, self.path)
-        return read(path)
-
-    def _values(self, path: Path, model: type[BaseModel], remedy: str = REMEDY) -> dict[str, Any]:
-        """Return the object in a JSON file of the run; see read_values()."""
-        return self._read(path, lambda file: read_values(file, model, remedy))
+    def _no_link(self, file: Path) -> Path:
+        """Return a file of the run; raise InputError if it is a link."""
+        refuse_links(file, self.path)
+        return file
 
     def hashes(self) -> dict[str, str]:
         """Return hashes of the files that decide the picture beside the checkpoint, by their names.
@@ -161,7 +152,7 @@ class RunFolder:
         The place of the photos in run.json does not count.
         """
         files = (file for file in (self.config_file, self.scene_file, self.info_file) if file.is_file())
-        values = {file.name: self._read(file, read_object) for file in files}
+        values = {file.name: read_object(self._no_link(file)) for file in files}
         values.get(self.info_file.name, {}).pop("data", None)
         return {
             name: hashlib.sha256(json.dumps(each, sort_keys=True).encode()).hexdigest() for name, each in values.items()
@@ -170,17 +161,17 @@ class RunFolder:
     def read_config(self) -> Config:
         """Return the config of the training, with the iterations that it was extended to."""
         self.read_info()  # It names a run of another version as such.
-        config = config_from_dict(self._read(self.config_file, read_object), self.config_file)
+        config = config_from_dict(read_object(self._no_link(self.config_file)), self.config_file)
         if not self.extension.is_file():
             return config
-        iterations = self._read(self.extension, read_object).get("iterations")
+        iterations = read_object(self._no_link(self.extension)).get("iterations")
         if not isinstance(iterations, int) or iterations < config.schedule.iterations:
             raise InputError(self.extension, f"iterations = {iterations!r:.40} is not usable", REMEDY)
         return override_config(config, {"schedule.iterations": iterations})
 
     def read_info(self) -> dict:
         """Return the values of run.json; see RunValues."""
-        info = self._values(self.info_file, RunValues)
+        info = read_values(self._no_link(self.info_file), RunValues)
         try:
             Response.from_dict(info["response"])
         except SehdrError as error:
@@ -189,7 +180,7 @@ class RunFolder:
 
     def read_scene(self) -> dict:
         """Return the values of scene.json, see describe_scene()."""
-        return {"notes": []} | self._values(self.scene_file, SceneValues)
+        return {"notes": []} | read_values(self._no_link(self.scene_file), SceneValues)
 
     def read_cameras(self) -> tuple[CameraEntry, ...]:
         """Return the views of the scene, in its order."""
@@ -216,19 +207,19 @@ class RunFolder:
         """Return the decisions of the run's plan, see DecisionValues; none without a plan."""
         if not self.plan_file.exists():
             return []
-        return self._values(self.plan_file, PlanValues, _REMOVE_FILE)["decisions"]
+        return read_values(self._no_link(self.plan_file), PlanValues, _REMOVE_FILE)["decisions"]
 
     def read_summary(self) -> dict:
         """Return times, memory and counts of the training, see SummaryValues; empty if it has not ended."""
         if not self.summary_file.exists():
             return {}
-        return self._values(self.summary_file, SummaryValues, _REMOVE_FILE)
+        return read_values(self._no_link(self.summary_file), SummaryValues, _REMOVE_FILE)
 
     def read_metrics(self) -> list[dict]:
         """Return the evaluations during the training, see MetricsValues; lines that a kill cut are left out."""
         if not self.metrics.is_file() or self.metrics.stat().st_size == 0:
             return []
-        return self._read(self.metrics, lambda path: list(read_metrics_lines(path)))
+        return list(read_metrics_lines(self._no_link(self.metrics)))
 
     def newest_checkpoint(self, parts: tuple[str, ...] = ("",)) -> Checkpoint | None:
         """Return the newest sound checkpoint, None if there is none at all.

@@ -47,19 +47,26 @@ def best_if_overfitted(points: Sequence[Evaluation]) -> Evaluation | None:
 
 def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) -> list[str]:
     """Return advice on a training, if it is finished; its commands repeat `data` and the other options by name."""
-    run, photos = trainer.run, len(trainer.scene.train_views)
+    run, scene = trainer.run, trainer.scene
     if trainer.iteration < trainer.total:
         return []
-    steps = trainer.total if "schedule.iterations" in trainer.config.plan.keep else None
-    words = option_words({name: data.get(name) for name in LOAD_OPTIONS} | options)
-    summary = run.summary() | {"metrics": run.metrics()}
-    scene, unplaced = data.get("path") or "SCENE", trainer.scene.unplaced
-    folders = {str(view.source.parent) for view in trainer.scene.views if view.source is not None}
+    place = data.get("path") or "SCENE"
+    folders = {str(view.source.parent) for view in scene.views if view.source is not None}
     posed = None
-    if folders and trainer.scene.format not in FOUND:
-        posed = folders.pop() if len(folders) == 1 else scene  # No folder holds the photos of several alone.
-    misfit = any(MISFIT in note for note in trainer.scene.notes)
-    return advice(run.path, summary, photos, scene, words, trainer.first_iteration, unplaced, steps, posed, misfit)
+    if folders and scene.format not in FOUND:
+        posed = folders.pop() if len(folders) == 1 else place  # No folder holds the photos of several alone.
+    return advice(
+        run.path,
+        run.summary() | {"metrics": run.metrics()},
+        len(scene.train_views),
+        place,
+        option_words({name: data.get(name) for name in LOAD_OPTIONS} | options),
+        resumed_at=trainer.first_iteration,
+        unplaced=scene.unplaced,
+        steps=trainer.total if "schedule.iterations" in trainer.config.plan.keep else None,
+        posed=posed,
+        misfit=any(MISFIT in note for note in scene.notes),
+    )
 
 
 def advice(
@@ -68,6 +75,7 @@ def advice(
     train_photos: int,
     scene: str = "SCENE",
     options: Sequence[str] = (),
+    *,
     resumed_at: int = 0,
     unplaced: int = 0,
     steps: int | None = None,

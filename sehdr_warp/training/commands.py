@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 from tyro.conf import Positional
@@ -212,15 +212,10 @@ def _train(args: Train, ranks=None) -> None:
         with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
             # Iterating the trainer trains; serve_training() answers browsers between its steps.
             run_with_progress(steps, trainer.total)
-    repeated = options_of_run(trainer.run) if output.resume else _named_options(args)
+    options = {"response": args.scene.response, "preset": args.training.preset, "seed": args.training.seed}
+    repeated = options_of_run(trainer.run) if output.resume else configs.named_fields(args.fields) | options
     repeated |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
     _print_result(args, trainer.run, advice_on(trainer, data, repeated))
-
-
-def _named_options(args: Train) -> dict[str, Any]:
-    """Return the options on the command line of a new training that the commands of its advice repeat."""
-    options = {"response": args.scene.response, "preset": args.training.preset, "seed": args.training.seed}
-    return configs.named_fields(args.fields) | options
 
 
 def _print_plan(args: Train) -> None:

@@ -1,7 +1,7 @@
 """Facts of a scene that a training needs: figures of photos and cameras for the plan, and the HDR truth."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,17 +175,14 @@ def largest_hdr_truth(scene: Scene, loss: LossConfig) -> float:
     return largest
 
 
-def check_hdr_truth(scene: str, views: Sequence[tuple[str, bool]], loss: LossConfig) -> None:
-    """Raise InputError, with scene and field, if HDR truth that the loss needs is missing.
-
-    `views` has the name of each training view, and whether it has HDR truth.
-    """
+def _check_truth(scene: str, has_truth: Mapping[str, bool], loss: LossConfig) -> None:
+    """Raise InputError, with scene and field, if training views, by name, lack HDR truth that the loss needs."""
     if not loss.uses_hdr:
         return
-    if not any(has_truth for _, has_truth in views):
+    if not any(has_truth.values()):
         problem = f"no training view has the HDR truth that {_truth_field(loss)} needs"
         raise InputError(scene, problem, _REMEDY)
-    if loss.ldr_weight == 0 and (lacking := next((name for name, has_truth in views if not has_truth), None)):
+    if loss.ldr_weight == 0 and (lacking := next((name for name in has_truth if not has_truth[name]), None)):
         problem = f"view {lacking} lacks the HDR truth that {_truth_field(loss)} needs where loss.ldr_weight = 0.0"
         raise InputError(scene, problem, _REMEDY)
 
@@ -197,7 +194,7 @@ def _truth_field(loss: LossConfig) -> str:
 
 def check_scene_truth(scene: Scene, loss: LossConfig) -> None:
     """Raise InputError if training views of a scene lack HDR truth that the loss needs."""
-    check_hdr_truth(scene.name, [(view.name, view.hdr is not None) for view in scene.train_views], loss)
+    _check_truth(scene.name, {view.name: view.hdr is not None for view in scene.train_views}, loss)
 
 
 def check_dataset_truth(data: LoadArguments, config: Config) -> None:
@@ -214,5 +211,5 @@ def check_dataset_truth(data: LoadArguments, config: Config) -> None:
     assert path is not None, "the caller checks the path"
     dataset = parse_dataset(path, exposure_index=data.get("exposure_index"), holdout=data.get("holdout"))
     records = zip(unique_names(dataset.records), dataset.records, strict=True)
-    views = [(name, record.hdr is not None) for name, record in records if record.split == "train"]
-    check_hdr_truth(dataset.name, views, config.loss)
+    has_truth = {name: record.hdr is not None for name, record in records if record.split == "train"}
+    _check_truth(dataset.name, has_truth, config.loss)

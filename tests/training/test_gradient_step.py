@@ -1,10 +1,10 @@
-"""DropGaussian in steps of a training."""
+"""Gradient steps: which Gaussians DropGaussian leaves out of them."""
 
 import pytest
 import torch
 
 from sehdr_warp.model.gaussians import moments_of
-from sehdr_warp.training.dropout import Dropout
+from sehdr_warp.training.gradient_step import Dropout
 
 from .toy import VARIANTS, make_trainer, quick
 
