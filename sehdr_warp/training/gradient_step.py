@@ -17,13 +17,13 @@ from ..model.adam import Adam
 from ..model.gaussians import moments_of
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients, Rendering
-from ..rasterizer.ops.step_updates import differentiate
+from ..rasterizer.ops.step_updates import decide_step, differentiate, finiteness_of
 from ..rasterizer.tile_lists import MAX_SINGLE_SORT
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..scene import Scene
 from .losses import compared_image, data_loss, extra_images, opacity_loss
-from .optimizer import FlatGradients, guarded_step
+from .optimizer import FlatGradients
 from .ranks import Ranks
 from .scene_facts import largest_hdr_truth
 from .strategies import SEED_STRIDE, Strategy
@@ -248,22 +248,21 @@ class GradientStep:
             self.ranks.all_reduce_mean(self._flat_gradients.buffer)
 
     def apply_gradients(self, gradients: Gradients) -> Tensor:
-        """Update the parameters, unless the step is not finite; return its loss. Does not wait for the device."""
+        """Update the parameters, and return the loss. Does not wait for the device.
+
+        The device leaves out the update if loss or gradients are not finite, or if there were more intersections than
+        memory.
+        """
         rendering, loss, harmonics = gradients.rendering, gradients.loss, gradients.harmonics
         overflow = rendering.overflow
         if self._flat_gradients is not None:
             loss, overflow, harmonics = self._flat_gradients.distribute()
-        applied = guarded_step(
-            self.optimizer,
-            loss,
-            overflow,
-            harmonics,
-            step_counters=self.step_counters,
-            intersections=rendering.needed_intersections,
-            active_count=self.field.gaussians.active_count,
-        )
+        groups, factored = self.optimizer.param_groups, [] if harmonics is None else [harmonics.grad_colors]
+        grads = [p.grad for group in groups for p in group["params"] if p.grad is not None] + factored
+        flags = decide_step(loss, finiteness_of(grads), overflow, self.step_counters, rendering.needed_intersections)
+        self.optimizer.step(flags, harmonics, self.field.gaussians.active_count)
         if rendering.means2d is not None:
             height, width, _ = gradients.image.shape
-            self.strategy.accumulate(rendering, width, height, applied)
+            self.strategy.accumulate(rendering, width, height, flags.applied)
         self.optimizer.zero_grad()
         return loss

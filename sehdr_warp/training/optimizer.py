@@ -15,7 +15,6 @@ from ..model.adam import BETAS, FIRST_HARMONIC, Adam
 from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.radiance_field import RadianceField
 from ..rasterizer import HarmonicsGradients
-from ..rasterizer.ops.step_updates import decide_step, finiteness_of
 from ..runs.checkpoint import under
 from ..runs.config import Config
 
@@ -62,30 +61,6 @@ def set_means_rate(optimizer: Adam, rate: float) -> None:
         group["lr"].fill_(rate)
     else:
         group["lr"] = rate
-
-
-def guarded_step(
-    optimizer: Adam,
-    loss: Tensor,
-    overflow: Tensor | None = None,
-    harmonics: HarmonicsGradients | None = None,
-    *,
-    step_counters: Tensor | None = None,
-    intersections: Tensor | None = None,
-    active_count: Tensor | None = None,
-) -> Tensor:
-    """Run one step of Adam, unless the loss or a gradient is not finite or there were more intersections than memory.
-
-    The decision is applied on the device, without waiting for it.
-
-    Arguments are those of decide_step() and Adam.step(). Returns a scalar float tensor: 1 if the step was applied, else
-    0.
-    """
-    gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-    gradients += [] if harmonics is None else [harmonics.grad_colors]
-    flags = decide_step(loss, finiteness_of(gradients), overflow, step_counters, intersections)
-    optimizer.step(flags, harmonics, active_count)
-    return flags.applied
 
 
 class FlatGradients:

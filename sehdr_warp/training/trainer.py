@@ -6,7 +6,7 @@ training_state.py lists what a checkpoint holds. On several ranks, each runs thi
 
 A gradient step is GradientStep.run(). Its compute_gradients() calls RadianceField.render_train_view() -> rasterize()
 (kernels project, tiles, blend_cuda or blend_cpu), then data_loss() and differentiate(); its apply_gradients() calls
-guarded_step() -> Adam.step() (on a GPU, kernels step_updates). On a GPU, StepGraphs.run() captures it as a CUDA graph;
+decide_step() -> Adam.step() (on a GPU, kernels step_updates). On a GPU, StepGraphs.run() captures it as a CUDA graph;
 a replay repeats its kernels. create_trainer() writes the checkpoint of iteration 0, before the first step.
 """
 
@@ -20,7 +20,7 @@ from functools import cache, partial
 import torch
 from torch import Tensor
 
-from ..errors import SehdrError
+from ..errors import InputError, SehdrError
 from ..model.radiance_field import RadianceField
 from ..model.renders import RenderedView
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
@@ -40,7 +40,7 @@ from .scene_facts import is_large
 from .step_graphs import StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
 from .training_state import TrainingProgress
-from .training_views import PhotoOrder, TrainingViews, check_projections, first_non_pinhole
+from .training_views import PhotoOrder, TrainingViews
 
 log = logging.getLogger(__name__)
 
@@ -112,8 +112,12 @@ class Trainer:
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.order = PhotoOrder(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
-        check_projections(normalized, config)
-        self.can_seed = first_non_pinhole(normalized) is None  # Seeding samples pixels of pinhole photos.
+        # Projected centers, which "adc" needs, and seeding are for pinhole photos alone.
+        wide = next((view for view in views if not view.camera.is_pinhole), None)
+        if wide is not None and config.densification.strategy == "adc":
+            problem = f"view {wide.name} is {wide.camera.projection}, for which densification.strategy = 'adc' has no "
+            raise InputError(scene.name, f"{problem}projected centers", "use densification.strategy=mcmc")
+        self._can_seed = wide is None
         own_matcher = cache(partial(make_matcher, normalized, field.response, self.device))
         self._get_matcher: Callable[[], Matcher] | None = get_matcher or own_matcher  # None after the last refinement
 
@@ -256,7 +260,7 @@ class Trainer:
         """Refine the Gaussians; on several ranks, rank 0 does and the others receive the result."""
         gaussians, strategy, ranks = self.field.gaussians, self.strategy, self.ranks
         count, reallocations = gaussians.count, gaussians.reallocations
-        propose = self._propose_gaussians if self.can_seed else None
+        propose = self._propose_gaussians if self._can_seed else None
         refine = partial(
             strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch
         )

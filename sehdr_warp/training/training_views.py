@@ -15,13 +15,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ..errors import InputError
 from ..limits import format_bytes
 from ..model.radiance_field import RadianceField
 from ..model.renders import CameraTensors
 from ..runs.config import Config
 from ..runs.light_estimates import ClippedLight, light_estimates
-from ..scene import Scene, View
+from ..scene import View
 from .losses import compares_exposures
 from .targets import PhotoSource, Target, TrainingView, ViewStack, select_view
 
@@ -29,20 +28,6 @@ log = logging.getLogger(__name__)
 
 SLOTS = 3  # One is read, one is filled, and one may still be read by a step that has not finished
 MAX_MEMORY_PART = 0.4  # Of the device's free memory for photos; stacking them takes as much again for a while
-
-
-def first_non_pinhole(scene: Scene) -> View | None:
-    """Return the first training view whose camera is not a pinhole, None if all are."""
-    return next((view for view in scene.train_views if not view.camera.is_pinhole), None)
-
-
-def check_projections(scene: Scene, config: Config) -> None:
-    """Raise InputError if the densification needs projected centers, which only pinholes have, and a view is none."""
-    view = first_non_pinhole(scene)
-    if view is not None and config.densification.strategy != "mcmc":
-        problem = f"view {view.name} is {view.camera.projection}, for which densification.strategy = "
-        problem += f"{config.densification.strategy!r} has no projected centers"
-        raise InputError(scene.name, problem, "use densification.strategy=mcmc")
 
 
 class PhotoOrder:

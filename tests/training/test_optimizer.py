@@ -5,10 +5,11 @@ from math import nan
 import pytest
 import torch
 
+from sehdr_warp.rasterizer.ops.step_updates import decide_step, finiteness_of
 from sehdr_warp.runs.checkpoint import Checkpoint
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.training.optimizer import WINDOWS, MovingAverage, guarded_step, make_optimizer
+from sehdr_warp.training.optimizer import WINDOWS, MovingAverage, make_optimizer
 from sehdr_warp.training.train import create_trainer, train
 
 from .toy import QUICK, load_unscaled, toy_field
@@ -25,7 +26,9 @@ def test_a_guarded_step_is_made_or_left_out_whole(device, overflow, bad):
     loss.backward()
     flag = None if overflow is None else torch.tensor(overflow, device=device)
     step_counters = torch.zeros(3, dtype=torch.int64, device=device)
-    step = guarded_step(optimizer, loss, flag, step_counters=step_counters)
+    flags = decide_step(loss, finiteness_of([means.grad]), flag, step_counters)
+    optimizer.step(flags)
+    step = flags.applied
     assert step_counters.tolist() == [bad, 0, 0]
     assert bool(step) == (not bad and not overflow)
     assert torch.equal(means, before) == (not bool(step))

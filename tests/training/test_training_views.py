@@ -20,7 +20,7 @@ from sehdr_warp.training.initialization import make_field
 from sehdr_warp.training.targets import PhotoSource, ViewStack
 from sehdr_warp.training.train import train
 from sehdr_warp.training.training_state import state_of
-from sehdr_warp.training.training_views import PhotoOrder, PhotoStream, check_projections
+from sehdr_warp.training.training_views import PhotoOrder, PhotoStream
 
 from .recorded import captured
 from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, toy_scene
@@ -117,9 +117,9 @@ def test_gradients_of_a_panorama_reach_all_parameters():
 
 
 def test_a_densification_by_projected_centers_is_refused():
-    config = load_config("default", {"densification.strategy": "adc"})
+    config = load_config("default", {"densification.strategy": "adc", "response.name": "srgb"})
     with pytest.raises(InputError, match=r"p0 is equirectangular.*use densification.strategy=mcmc"):
-        check_projections(panoramas(3), config)
+        make_trainer(panoramas(3), config)
 
 
 def unlike_photos(scene):
