@@ -74,7 +74,14 @@ def write_scene_page(
         gaussians = replace(gaussians, means=from_middle.points(gaussians.means))
         entries = [replace(entry, camera=from_middle.camera(entry.camera)) for entry in entries]
         opening = _moved(opening, from_middle)
-    harmonics = np.clip(gaussians.harmonics * np.float32(run.base_time), -_HALF, _HALF)
+    harmonics = gaussians.harmonics * np.float32(run.base_time)
+    too_bright = (np.abs(harmonics) > _HALF).any(axis=(1, 2))
+    if too_bright.any():
+        text = "%s: its half floats end at %.0f times white; %d Gaussians are brighter, up to %.3g times, "
+        text += "and are shown at that; .usdc, or .ply with --kind hdr, keeps their light"
+        brightest = HARMONIC_0 * float(harmonics[:, 0].max())
+        log.warning(text, path.name, HARMONIC_0 * _HALF, too_bright.sum(), brightest)
+        harmonics = np.clip(harmonics, -_HALF, _HALF)
     columns = dict(zip("xyz", gaussians.means.T))
     # As 3DGS has them: a color is 0.5 and the sum.
     columns |= {f"f_dc_{i}": harmonics[:, 0, i] - 0.5 / HARMONIC_0 for i in range(3)}

@@ -72,6 +72,11 @@ def test_exposure_probe_and_saved_exr_agree(chromium, serve, tmp_path):
         assert run.rendered == rendered  # Exposure renders nothing.
         page.mouse.move(130, 90)
         probed, probe_text = page.evaluate("window.viewer.probed()"), page.text_content("#probe")
+        # Frames are half floats: brighter light is said to be at least the largest of them.
+        page.evaluate(
+            "light.frames.scene = {...light.frames.scene, half: light.frames.scene.half.map(() => 0x7bff)}, probe()"
+        )
+        assert page.text_content("#probe").count("\N{GREATER-THAN OR EQUAL TO}") == 3
         with page.expect_download() as download:
             page.click("[data-save=exr]")
         download.value.save_as(tmp_path / "view.exr")

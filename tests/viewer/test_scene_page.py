@@ -23,6 +23,7 @@ from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera
+from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.train import train
 
 from ..output.export.test_splat_edits import run_of, splats
@@ -126,6 +127,18 @@ def test_a_page_of_map_coordinates_is_that_of_the_scene_near_the_origin(tmp_path
     for near, far in cameras:
         np.testing.assert_allclose(far["world_to_camera"], near["world_to_camera"], atol=1e-5)
     np.testing.assert_allclose(far_facts["focus"], facts["focus"], atol=1e-5)
+
+
+def test_light_beyond_half_floats_is_named(tmp_path, caplog):
+    lights = np.array([1.0, 1e5, 4e5])
+    harmonics = np.tile((lights / HARMONIC_0)[:, None, None], (1, 1, 3)).astype(np.float32)
+    gaussians = splats([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [0.9] * 3)
+    write_scene_page(
+        run_of(tmp_path, replace(gaussians, color_model="linear", harmonics=harmonics)), tmp_path / "a.html"
+    )
+    assert (
+        "a.html: its half floats end at 18478 times white; 2 Gaussians are brighter, up to 4e+05 times" in caplog.text
+    )
 
 
 def read_page(file):

@@ -228,7 +228,7 @@ function probe() {
   const value = at && light.value(side, ...at), rows = [];
   if (value) {
     const [r, g, b, sure] = value, time = facts.base_time, l = luminance(value) * facts.grey * 2 ** state.stops;
-    rows.push(["radiance", [r, g, b].map(x => figure(x / time)).join("&ensp;")]);
+    rows.push(["radiance", [r, g, b].map(x => (x < HALVES[0x7bff] ? "" : "\u2265") + figure(x / time)).join("&ensp;")]);
     rows.push(["from grey", l > 0 ? stopsText(Math.log2(l / 0.18)) : "\u2013"]);
     rows.push(["confidence", drawn.draft || side === "other" || sure < 0 ? "\u2013" : `${Math.round(100 * sure)} %`]);
     rows.push(["depth", figure(light.value("depth", ...at)[0])]);
