@@ -166,10 +166,8 @@ def _check_render(args: Render) -> None:
         raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
     if args.out is None and (flags := changed_flags(args.pictures)):
         raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
-    pictures = dict(vars(args.pictures))
-    brackets = [pictures.pop("evs"), pictures.pop("exposures")]
-    del pictures["reference_white"], pictures["colorspace"]
-    check_options(args.cameras, args.size, pictures.pop("aovs"), brackets != [None, None], **pictures)
+    colors = "reference_white", "colorspace"
+    check_options(args.cameras, args.size, **{k: v for k, v in vars(args.pictures).items() if k not in colors})
     if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
     check_rate(args.film.fps)
@@ -272,8 +270,13 @@ def run_environment_map(args: EnvironmentMap) -> None:
     from .lighting.environment_map import check_map, write_environment_map
 
     check_map(args.out, args.size, args.layout, args.world.axes, args.beyond, args.pixel)
+    print(write_environment_map(open_scene(args.run, args.device), args.out, **_options(args)))
+
+
+def _options(args: "EnvironmentMap | Lights") -> dict[str, Any]:
+    """Return the options of a command line as arguments of the function that writes its file."""
     options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
-    print(write_environment_map(open_scene(args.run, args.device), args.out, **options, **vars(args.world)))
+    return options | vars(args.world)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,8 +322,7 @@ def run_lights(args: Lights) -> None:
         return
     check_place(args.at)
     run = open_run(args.run, args.device)
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "out", "device", "world")}
-    for path in write_lights(run, args.out, **options, **vars(args.world)):
+    for path in write_lights(run, args.out, **_options(args)):
         print(path)
 
 

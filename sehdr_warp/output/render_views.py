@@ -108,9 +108,8 @@ def render_views(
         InputError: If a file would be replaced or a pixel is not finite.
     """
     refuse_paths("load_run", run)
-    has_brackets = evs is not None or exposures is not None
     options = {"multipart": multipart, "ldr_brackets": ldr_brackets, "group_by": group_by, "ocio": ocio, "view": view}
-    check_options(cameras, size, aovs, has_brackets, pixel=pixel, **options)
+    check_options(cameras, size, aovs=aovs, evs=evs, exposures=exposures, pixel=pixel, **options)
     out = Path(out)
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, size=size, transform=transform, up=up)
@@ -118,7 +117,7 @@ def render_views(
     header = PictureHeader.of(run, transform, colorspace)
     hdr_exposure = exposure_of_white(run, reference_white)
     brackets = None
-    if has_brackets:
+    if evs is not None or exposures is not None:
         brackets = BracketWriter(
             out=out,
             exposures=bracket_exposures(run.base_time, evs=evs, exposures=exposures),
@@ -177,9 +176,10 @@ def render_views(
 def check_options(
     cameras: str | Path,
     size: str | tuple[int, int] | None,
-    aovs: str | Sequence[str],
-    has_brackets: bool,
     *,
+    aovs: str | Sequence[str],
+    evs: Items | None,
+    exposures: Items | None,
     pixel: str,
     multipart: bool,
     ldr_brackets: str | None,
@@ -192,7 +192,7 @@ def check_options(
     if size is not None:
         read_size(size)
     read_aovs(aovs)
-    if not has_brackets and (multipart or ldr_brackets or group_by != "view"):
+    if evs is None and exposures is None and (multipart or ldr_brackets or group_by != "view"):
         raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
     check_pixel_type(pixel)
     if (ocio is None) != (view is None):

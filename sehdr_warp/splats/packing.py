@@ -1,5 +1,7 @@
 """Helpers of compressed files of Gaussians: order in space, small codebooks, quaternions by three components."""
 
+from warnings import catch_warnings, simplefilter
+
 import numpy as np
 
 CODES = 256
@@ -122,21 +124,9 @@ def logits(opacities: np.ndarray) -> np.ndarray:
 
 def _k_means(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return [count, D] centers and labels [N]; rows [N, D], N >= count."""
-    random = np.random.default_rng(0)
-    centers = rows[np.sort(random.choice(len(rows), count, replace=False))].copy()
-    labels = _nearest(rows, centers)
-    for _ in range(_ROUNDS // 2):
-        counts = np.bincount(labels, minlength=count)
-        sums = np.zeros(centers.shape, np.float64)
-        np.add.at(sums, labels, rows)
-        filled = counts > 0
-        centers[filled] = sums[filled] / counts[filled, None]
-        labels = _nearest(rows, centers)
-    return centers, labels
+    from scipy.cluster.vq import kmeans2
 
-
-def _nearest(rows: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    norms = (centers * centers).sum(axis=1)
-    step = max(1, (1 << 24) // max(len(centers), 1))
-    parts = [(norms - 2 * rows[i : i + step] @ centers.T).argmin(axis=1) for i in range(0, len(rows), step)]
-    return np.concatenate(parts)
+    start = rows[np.sort(np.random.default_rng(0).choice(len(rows), count, replace=False))]
+    with catch_warnings():
+        simplefilter("ignore")  # Of equal rows some clusters are empty.
+        return kmeans2(rows, start, iter=_ROUNDS // 2 + 1, minit="matrix", check_finite=False)
