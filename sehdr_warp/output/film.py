@@ -56,10 +56,9 @@ class Transfer:
 _X265 = "log-level=error:repeat-headers=1"
 # x265 4 writes beyond its arrays for adaptive quantization of pictures narrower than 50 pixels.
 _X265_SMALL, _X265_SMALLEST_SIDE = ":aq-mode=0:no-cutree=1", 64
-# As if mastered on a Rec.2020 display of PEAK; the steps are 0.00002 and 0.0001 cd/m2.
-_MASTER = (
-    "hdr-opt=1:master-display=G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)L(10000000,50):max-cll=1000,400"
-)
+# As if mastered on a Rec.2020 display of PEAK; the steps are 0.00002 and 0.0001 cd/m2. No pixel is brighter. The
+# mean of the brightest frame is not known while the first one is written; 0 states that.
+_MASTER = "hdr-opt=1:master-display=G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)L(10000000,50):max-cll=1000,0"
 LOG_CURVES = {
     "logc3": ("ARRI LogC3", "ARRI Wide Gamut 3"),
     "slog3": ("S-Log3", "S-Gamut3.Cine"),

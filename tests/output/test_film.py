@@ -72,6 +72,14 @@ def test_a_film_holds_the_light_and_says_how(tmp_path, transfer, codec, tags):
         assert encode(np.ones(3), "hdr10") == pytest.approx(0.581, abs=2e-3) and decoded.max() > 0.65
 
 
+def test_hdr10_states_the_brightest_pixel_and_no_mean_that_it_does_not_know(tmp_path):
+    run, cameras = smooth_run()
+    write_film(run, tmp_path / "f.mp4", cameras[:1], transfer="hdr10", ev_ramp=(6, 6))
+    with av.open(str(tmp_path / "f.mp4")) as container:
+        stated = {each.type.name: bytes(each) for each in next(container.decode(video=0)).side_data}
+    assert np.frombuffer(stated["CONTENT_LIGHT_LEVEL"], "<u4").tolist() == [1000, 0]
+
+
 @pytest.mark.parametrize("name, transfer", [("f.mp4", "sdr"), ("f.mov", "logc3")])
 def test_a_film_states_the_shape_of_its_pixels_and_rates_of_television(tmp_path, name, transfer):
     """Anamorphic cameras have pixels twice as wide as high; 23.976 stands for 24000 frames in 1001 seconds."""

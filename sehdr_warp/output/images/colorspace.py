@@ -6,9 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import SehdrError
-
-# ITU-R BT.709-6: what is written unless asked otherwise needs no colour-science, which takes seconds to load.
-_REC709 = (0.640, 0.330, 0.300, 0.600, 0.150, 0.060, 0.3127, 0.3290)
+from ...scene.color.primaries import REC709
 
 
 class ColorSpace(NamedTuple):
@@ -58,7 +56,7 @@ def color_space(name: str) -> ColorSpace:
 def chromaticities(name: str) -> tuple[float, ...]:
     """Return CIE xy of red, green, blue and white: eight numbers in the order of OpenEXR's `chromaticities`."""
     if color_space(name).name == "rec709":
-        return _REC709
+        return REC709
     space = _dataset(color_space(name).dataset)
     return tuple(map(float, (*space.primaries.ravel(), *space.whitepoint)))
 

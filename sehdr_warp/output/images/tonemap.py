@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...errors import SehdrError
+from ...scene.color.primaries import linear_to_srgb
 
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene
@@ -81,8 +82,7 @@ def expose(radiance: np.ndarray, stops: float, *, scale: float = 1.0) -> np.ndar
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
     """Encode display-linear values, limited to [0, 1], by IEC 61966-2-1; float32."""
-    linear = np.clip(np.asarray(linear, np.float32), 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - np.float32(0.055))
+    return linear_to_srgb(np.clip(np.asarray(linear, np.float32), 0, 1))
 
 
 def display_gain(response: Any) -> float:
