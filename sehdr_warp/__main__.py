@@ -9,7 +9,6 @@ _OUT_OF_MEMORY = (
     b"sehdr-warp: out of memory; raise the limit (ulimit -v), or use smaller photos (--max-size) or pictures (--size)\n"
 )
 _LITTLE = 4 << 20  # Bytes of address space; a smaller rest is not enough for a module or a picture
-_LONGEST_CHAIN = 20  # Exceptions that one came from
 
 
 def run() -> None:
@@ -38,29 +37,8 @@ def run() -> None:
 
 
 def _is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an exception, or one that it came from, is of exhausted memory.
-
-    Libraries turn a failed allocation into exceptions of any kind, so whatever comes when the address space is used up
-    counts. That this itself finds no memory is an answer as well.
-    """
-    if isinstance(error, (SystemExit, KeyboardInterrupt)):
-        return False
-    try:
-        cause: BaseException | None = error
-        for _ in range(_LONGEST_CHAIN):
-            if cause is None:
-                break
-            if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno == errno.ENOMEM):
-                return True
-            if isinstance(cause, ImportError) and "map segment" in str(cause):
-                return True
-            # Python says this where it found no memory for the exception itself.
-            if isinstance(cause, SystemError) and "without exception set" in str(cause):
-                return True
-            cause = cause.__cause__ or cause.__context__
-        return _address_space_left() < _LITTLE
-    except MemoryError:
-        return True
+    """Return whether memory is exhausted, which libraries turn into exceptions of any kind."""
+    return isinstance(error, MemoryError) or (isinstance(error, Exception) and _address_space_left() < _LITTLE)
 
 
 def _address_space_left() -> float:

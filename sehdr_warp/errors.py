@@ -139,7 +139,7 @@ def visible(text: str) -> str:
 
 
 _OUT_OF_MEMORY = re.compile(
-    r"allocate memory|[Ff]ailed to allocate|bad_alloc|out of memory|map segment|start new thread"
+    r"allocate memory|[Ff]ailed to allocate|bad_alloc|out of memory|map segment|start new thread|without exception set"
 )
 
 
@@ -150,9 +150,10 @@ def as_user_error(error: Exception) -> SehdrError | None:
     """
     if isinstance(error, SehdrError):
         return error
-    text = f"{error} {error.__cause__ or error.__context__ or ''}"
-    out_of_memory = isinstance(error, RuntimeError | ImportError | OSError) and _OUT_OF_MEMORY.search(text)
-    if out_of_memory or isinstance(error, MemoryError):
+    cause = error.__cause__ or error.__context__
+    kinds = RuntimeError | ImportError | OSError | SystemError
+    out_of_memory = isinstance(error, kinds) and _OUT_OF_MEMORY.search(f"{error} {cause or ''}")
+    if out_of_memory or isinstance(error, MemoryError) or isinstance(cause, MemoryError):
         reason = (str(error).splitlines() or ["no more"])[0]
         remedy = "use smaller photos (--max-size), smaller pictures (--size) or a larger machine"
         return SehdrError(f"out of memory ({reason}); {remedy}")

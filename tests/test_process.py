@@ -171,6 +171,11 @@ except KeyboardInterrupt:
     assert output == (b"" if kind == "without an end" else b" complete")
 
 
+def caused(error, cause):
+    error.__cause__ = cause
+    return error
+
+
 @pytest.mark.parametrize(
     "error, message",
     [
@@ -178,6 +183,9 @@ except KeyboardInterrupt:
         (OSError(5, "Input/output error"), "a file: cannot be used (Input/output error)"),
         (MemoryError(), "out of memory (no more)"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 bytes"), "out of memory (Default"),
+        (SystemError("error return without exception set"), "out of memory (error return"),
+        (caused(SystemError("NULL"), MemoryError()), "out of memory (NULL"),
+        (caused(RuntimeError("x"), OSError(12, "Cannot allocate memory")), "out of memory (x"),
         (ImportError("libx.so: failed to map segment from shared object"), "out of memory (libx.so"),
         (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates"), r"'\udcff': is a name that is not UTF-8"),
         (UsageError("train needs --out"), "train needs --out"),

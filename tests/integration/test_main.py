@@ -10,10 +10,7 @@ resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (1 << 2
 raise SystemError('returned NULL without setting an exception')
 """
 CAUSES = {
-    "an error that came of it": "try:\n raise MemoryError\nexcept MemoryError:\n raise SystemError('NULL')",
-    "no memory for an exception": "raise SystemError('error return without exception set')",
-    "a refusal of the system": "raise RuntimeError from OSError(12, 'Cannot allocate memory')",
-    "an error of which no word can be made": "raise type('E', (ImportError,), {'__str__': lambda _: bytes(1 << 62)})",
+    "no memory": "raise MemoryError",
     "anything without address space": LIMIT,
 }
 
