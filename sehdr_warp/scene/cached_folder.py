@@ -29,12 +29,12 @@ def cached_folder(cache: Path | str | None, name: str, fill: Callable[[Path], No
     """
     folder = cache_folder(cache)
     place = (folder or Path()) / name
-    if folder and place.is_dir() and not is_as_listed(place):
+    if folder and place.is_dir():
+        if is_as_listed(place):
+            _log.info("using the cached result %s", place)
+            return place
         _log.warning("%s is damaged and is made again", place)
         shutil.rmtree(place, ignore_errors=True)
-    if folder and place.is_dir() and is_as_listed(place):
-        _log.info("using the cached result %s", place)
-        return place
     if cache is None and not (folder and usable(folder) and not place.exists()):
         _temporaries.append(tempfile.TemporaryDirectory(prefix="sehdr-"))
         place = Path(_temporaries[-1].name) / name

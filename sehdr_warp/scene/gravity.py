@@ -128,8 +128,8 @@ def typical_roll(cameras: Sequence[Camera], up: np.ndarray) -> float:
 
 
 def looks_down(cameras: Sequence[Camera], up: np.ndarray) -> bool:
-    """Return whether the cameras look straight down, or nearly so: the up of their pictures is level."""
-    return abs(float(_rotations(cameras)[:, 1].mean(axis=0) @ up)) < _DOWN
+    """Return whether the cameras look straight down, or nearly so: both axes of their pictures are level."""
+    return float(np.abs(_rotations(cameras)[:, :2].mean(axis=0) @ up).max()) < _DOWN
 
 
 def is_pitch_known(cameras: Sequence[Camera], up: np.ndarray) -> bool:

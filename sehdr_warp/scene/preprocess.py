@@ -26,7 +26,7 @@ from .images.hdr_files import hdr_size, read_hdr, read_light
 from .images.ldr_files import EncodedImage, file_kind
 from .lens import Lens, Undistortion
 from .masks import mask_note, read_mask
-from .photo_content import ContentCheck, unused_bits_note
+from .photo_content import require_content, unused_bits_note
 from .photo_storage import PhotoKeeper
 from .photos import fitted_lens, read_photo, stored_orientation, unusable_notes
 from .raw.decode import linear_codes
@@ -82,10 +82,7 @@ def preprocess(
     truth_count = sum(record.hdr is not None for record in dataset.records)
     damaged = unusable_notes(problems, len(names))
     damaged += unusable_notes(preprocessor.unusable_truth, truth_count, truth=True)
-    content = ContentCheck()
-    for view in [view for view in views if view.split == "train"] or views:
-        content.add(view.codes, view.mask)
-    content.require_content(dataset.folder)
+    require_content([view for view in views if view.split == "train"] or views, dataset.folder)
     masks = mask_note(list(preprocessor.mask_shares.values()), len(preprocessor.labeled_masks))
     if preprocessor.transparent:
         meaning = "are left out" if dataset.alpha == "mask" else "count as black light"
@@ -220,20 +217,8 @@ class _Preprocessor:
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         above = {"light_above_white": photo.above_white, "light_above_white_deviation": photo.above_white_deviation}
-        orientation = 1 if oriented else stored_orientation(record.image)
-        return View(
-            name,
-            photo.pixels,
-            camera,
-            time,
-            split,
-            mask,
-            hdr,
-            record.image,
-            **above,
-            lens=record.lens,
-            orientation=orientation,
-        )
+        facts = {"lens": record.lens, "orientation": 1 if oriented else stored_orientation(record.image)}
+        return View(name, photo.pixels, camera, time, split, mask, hdr, record.image, **above, **facts)
 
     def _truth(self, record: ImageRecord, lens: Lens, resample: _Resampler) -> np.ndarray | None:
         """Return the truth of a photo at the size of its view; None without a file, or with one that cannot be used."""

@@ -14,7 +14,6 @@ from .dataparser import DataparserOutputs
 from .images.exif import are_camera_jpegs
 from .images.gain_map import MOST_STOPS_IN_CODES, read_gain_map
 from .images.ldr_files import has_16_bits
-from .photo_content import ContentCheck
 from .preprocess import read_codes
 from .raw.decode import color_matrix
 from .types import View
@@ -156,7 +155,7 @@ def as_gain_mapped(dataset: DataparserOutputs) -> DataparserOutputs:
 
 def _select_for_dataset(dataset: DataparserOutputs, method: str, candidates: Sequence[str]) -> "ResponseSelection":
     """Select the response from the codes of a sample of the training photos, which are read one by one."""
-    records, content = dataset.training, ContentCheck()
+    records = dataset.training
 
     def codes() -> Iterator[np.ndarray]:
         for record in _sample(records, method):
@@ -166,12 +165,8 @@ def _select_for_dataset(dataset: DataparserOutputs, method: str, candidates: Seq
                 continue  # Preprocessing names it.
             if image.alpha is not None:  # Transparent pixels have no color, nearly opaque ones have theirs.
                 image.pixels[image.alpha < 0.5] = 0
-            pixels = image.pixels
+            yield image.pixels
             del image  # Free the memory before the next photo is read.
-            content.add(pixels)
-            yield pixels
-            del pixels
-        content.require_content(dataset.folder)
 
     files = [None if record.derived else record.image for record in records]
     return select_for_codes(codes(), files, method, candidates)

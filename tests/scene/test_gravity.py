@@ -10,7 +10,7 @@ from scipy.ndimage import rotate
 from scipy.spatial.transform import Rotation
 
 from sehdr_warp.scene import Camera, Scene, View, load_scene, look_at
-from sehdr_warp.scene.gravity import UpDirection, find_up, up_direction, up_from_lines
+from sehdr_warp.scene.gravity import UpDirection, find_up, looks_down, up_direction, up_from_lines
 
 UP = np.array([0.0, 0, 1])
 
@@ -151,3 +151,4 @@ def test_phone_photos_stored_on_their_side_stand_upright(tmp_path):
     scene = load_scene(tmp_path, response="srgb")
     assert degrees(up_direction([view.camera for view in scene.views])) > 80
     assert degrees(find_up(scene).direction) < 2
+    assert not looks_down([view.camera for view in scene.views], UP)

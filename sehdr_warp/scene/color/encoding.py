@@ -21,9 +21,9 @@ from ...errors import InputError
 from ...subsets import first_names
 from ..images.heif import read_items
 from ..images.ldr_files import PILLOW_ERRORS, EncodedImage, exif_of, png_chunks
-from .icc import IccTable, KnownColors, read_profile, xyz_to_rec709
+from .icc import IccTable, read_profile
 from .primaries import REC709, matrix_to_rec709, srgb_to_linear
-from .srgb_codes import encoded_in_bands
+from .srgb_codes import bands_of, srgb_codes
 
 _ADOBE_RGB = (0.640, 0.330, 0.210, 0.710, 0.150, 0.060, 0.3127, 0.3290)
 _ADOBE_GAMMA = 563 / 256
@@ -85,7 +85,7 @@ class ColorEncoding:
         if self.table is None:
             light = self._decode(pixels)
         else:
-            light = self._known_colors.light(pixels) if pixels.dtype == np.uint8 else self._convert(pixels)
+            light = self.table.light(pixels)
         if above is not None:
             light, clipped = np.where(above > 0, above, light), clipped & (above == 0)
         if self.to_rec709 is not None:
@@ -108,19 +108,10 @@ class ColorEncoding:
             return decoders[0][pixels]
         return np.stack([decoder[pixels[..., channel]] for channel, decoder in enumerate(decoders)], axis=-1)
 
-    def _convert(self, pixels: np.ndarray) -> np.ndarray:
-        assert self.table is not None
-        values = pixels / np.float32(np.iinfo(pixels.dtype).max)
-        return xyz_to_rec709(self.table.to_xyz(values)).astype(np.float32)
-
     @cached_property
     def _decoders(self) -> dict[int, list[np.ndarray]]:
         """Decoded values of all codes, by the largest code; one array if all channels share it."""
         return {}
-
-    @cached_property
-    def _known_colors(self) -> KnownColors:
-        return KnownColors(self._convert)
 
     def convert(self, image: EncodedImage) -> EncodedImage:
         """Return a photo as the codes of a photo in sRGB, of 16 bits if they change.
@@ -129,11 +120,17 @@ class ColorEncoding:
         """
         if self.is_srgb:
             return image
-        alpha, above, deviation = image.alpha, image.above_white, image.above_white_deviation
-        codes, brighter = encoded_in_bands(image.pixels, above, self.to_linear)
-        if brighter is None:
-            return EncodedImage(codes, alpha)
-        return EncodedImage(codes, alpha, brighter, max(DEVIATION, deviation))
+        pixels, above, brighter = image.pixels, image.above_white, None
+        codes, encode = np.empty(pixels.shape, np.uint16), srgb_codes()
+        for rows in bands_of(slice(0, len(pixels)), pixels.shape[1]):
+            light, clipped = self.to_linear(pixels[rows], None if above is None else above[rows])
+            codes[rows] = np.where(clipped, np.uint16(65535), encode(light))
+            measurable = (light > 1) & ~clipped
+            if measurable.any():
+                brighter = np.zeros(pixels.shape, np.float16) if brighter is None else brighter
+                brighter[rows] = np.where(measurable, light, 0)
+        deviation = 0.0 if brighter is None else max(DEVIATION, image.above_white_deviation)
+        return EncodedImage(codes, image.alpha, brighter, deviation)
 
 
 def encoding_of(image: Image.Image) -> ColorEncoding | None:

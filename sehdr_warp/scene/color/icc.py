@@ -7,9 +7,8 @@ interpolated by tetrahedra here, as LittleCMS does.
 
 import io
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -66,6 +65,28 @@ class IccTable:
         cubes = roots * roots * roots
         light = np.where(cubes > _EPSILON, cubes, (116 * roots - 16) / np.float32(_KAPPA))
         return light * _D50.astype(np.float32)
+
+    def light(self, pixels: np.ndarray) -> np.ndarray:
+        """Return linear Rec.709 [H, W, 3] float32 of codes [H, W, 3] uint8 or uint16. Threads may call it together.
+
+        A color of 8 bits is converted when a photo shows it first.
+        """
+        if pixels.dtype != np.uint8:
+            return xyz_to_rec709(self.to_xyz(pixels / np.float32(65535))).astype(np.float32)
+        known, colors = self._known_colors
+        red, green, blue = (pixels[..., channel].astype(np.int32) for channel in range(3))
+        numbers = red | green << 8 | blue << 16
+        if len(new := np.unique(numbers[~known[numbers]])):
+            for some in np.array_split(new, 1 + len(new) // _AT_ONCE):
+                codes = np.stack([some & 255, some >> 8 & 255, some >> 16], axis=1)
+                colors[some] = xyz_to_rec709(self.to_xyz(codes / np.float32(255)))
+            known[new] = True  # After their light, which another thread may read now
+        return colors[numbers]
+
+    @cached_property
+    def _known_colors(self) -> tuple[np.ndarray, np.ndarray]:
+        # The system gives memory to pages that are written alone: photos show a small part of all colors.
+        return np.zeros(1 << 24, bool), np.zeros((1 << 24, 3), np.float32)
 
 
 @dataclass(frozen=True)
@@ -174,31 +195,6 @@ def _curve(tag: bytes) -> np.ndarray:
     if kind == 2:
         return np.where(x >= -b / a, power + c, c)
     return np.where(x >= d, power + (e if kind == 4 else 0), c * x + (f if kind == 4 else 0))
-
-
-class KnownColors:
-    """The light of codes of 8 bits by a slow conversion: each color is converted when a photo shows it first."""
-
-    def __init__(self, convert: Callable[[np.ndarray], np.ndarray]):
-        """Prepare for colors.
-
-        Args:
-            convert: returns the light [N, 3] of codes [N, 3] uint8.
-        """
-        self._convert = convert
-        # The system gives memory to pages that are written alone: photos show a small part of all colors.
-        self._known, self._light = np.zeros(1 << 24, bool), np.zeros((1 << 24, 3), np.float32)
-
-    def light(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the light [H, W, 3] float32 of codes [H, W, 3] uint8. Threads may call it at the same time."""
-        red, green, blue = (pixels[..., channel].astype(np.int32) for channel in range(3))
-        numbers = red | green << 8 | blue << 16
-        if len(new := np.unique(numbers[~self._known[numbers]])):
-            for some in np.array_split(new, 1 + len(new) // _AT_ONCE):
-                codes = np.stack([some & 255, some >> 8 & 255, some >> 16], axis=1).astype(np.uint8)
-                self._light[some] = self._convert(codes)
-            self._known[new] = True  # After their light, which another thread may read now
-        return self._light[numbers]
 
 
 def _read_table(tag: bytes, space: str) -> IccTable:

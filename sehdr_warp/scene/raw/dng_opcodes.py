@@ -37,11 +37,8 @@ class _Reader:
         return struct.unpack_from(f">{layout}", self.data, self.position - size)
 
     def array(self, kind: str, count: int) -> np.ndarray:
-        size = np.dtype(kind).itemsize * count
-        if self.position + size > len(self.data):
-            raise ValueError(f"ends early, at byte {len(self.data)}")
-        self.position += size
-        return np.frombuffer(self.data, f">{kind}", count, self.position - size).astype(np.float64)
+        (data,) = self.take(f"{np.dtype(kind).itemsize * count}s")
+        return np.frombuffer(data, f">{kind}").astype(np.float64)
 
 
 class _Area(NamedTuple):
