@@ -12,9 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...rasterizer.checks import check_shape, check_tensors
+from ...rasterizer.ops.relocation import MOST_COPIES, relocation_sums
 from .parameter_rows import Optimizers, Parameters, change_rows, write_rows
 from .projection import rotation_matrices
-from .relocation import compute_relocation
 
 State = dict[str, Any]
 REQUIRED = "means", "scales", "quats", "opacities"
@@ -316,3 +317,29 @@ def _draw(weights: Tensor, count: int) -> Tensor:
     steps = weights.double().cumsum(0)
     places = torch.searchsorted(steps, torch.rand(count, dtype=torch.float64, device=weights.device) * steps[-1])
     return places.clamp_max(len(weights) - 1)
+
+
+@torch.no_grad()
+def compute_relocation(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return opacities and sizes with which `ratios` Gaussians at one place look as one did (equation 9).
+
+    Args:
+        opacities: [N] in (0, 1).
+        scales: [N, 3].
+        ratios: [N], from 1; more than 51 count as 51.
+        binoms: has no effect; gsplat's table of binomials.
+
+    Raises:
+        TypeError: for what is not a tensor.
+        ValueError: for shapes, dtypes or devices that do not fit.
+    """
+    check_tensors(opacities=(opacities, ("N",)), scales=(scales, ("N", 3)))
+    check_shape("ratios", ratios, opacities.shape)
+    count = ratios.long().clamp(1, MOST_COPIES)
+    shared = 1 - (1 - opacities.double()).pow(1 / count)
+    powers = shared[:, None] ** torch.arange(1, MOST_COPIES + 1, device=opacities.device)
+    denominators = (relocation_sums(opacities.device)[count - 1] * powers).sum(1)
+    factors = (opacities.double() / denominators).to(scales.dtype)
+    return shared.to(opacities.dtype), scales * factors[:, None]
