@@ -71,15 +71,10 @@ class FlatGradients:
 
     def __init__(self, optimizer: Adam, rank: int, count: int, *, defer_sh: bool):
         """Allocate the buffer of rank `rank` of `count`; if `defer_sh`, harmonics are exchanged in factored form."""
-        groups = {group["name"]: group["params"] for group in optimizer.param_groups}
-        self.all = _parameters(optimizer)
-        self.parameters = [
-            parameter
-            for name, parameters in groups.items()
-            for parameter in parameters
-            if not (defer_sh and name in FIRST_HARMONIC)
-        ]
-        self._means, self._rank, self._count = groups["means"][0], rank, count
+        self.all = dict(_parameters(optimizer))
+        factored = tuple(f"{name}." for name in FIRST_HARMONIC) if defer_sh else ()
+        self.parameters = [parameter for name, parameter in self.all.items() if not name.startswith(factored)]
+        self._means, self._rank, self._count = self.all["means.0."], rank, count
         shapes = [parameter.shape for parameter in self.parameters]
         shapes += [(count, *self._means.shape), (count, 3)] if defer_sh else []
         sizes = [math.prod(shape) for shape in shapes]
@@ -91,7 +86,7 @@ class FlatGradients:
 
     def fits(self, optimizer: Adam) -> bool:
         """Return whether the optimizer still has the same parameters."""
-        return all(old is new for old, new in zip(self.all, _parameters(optimizer), strict=True))
+        return all(self.all[name] is parameter for name, parameter in _parameters(optimizer))
 
     @torch.no_grad()
     def collect(self, loss: Tensor, overflow: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
@@ -129,28 +124,22 @@ class FlatGradients:
         return self.numbers[0], self.numbers[1] > 0, harmonics
 
 
-def _parameters(optimizer: Adam) -> list[Tensor]:
-    """Return all parameters of an optimizer."""
-    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
-
-
 def optimizer_tensors(optimizer: Adam, batch: int = 1) -> dict[str, Tensor]:
     """Return Adam's state as named tensors, `<group>.<index>.<key>`, for a checkpoint.
 
     Step counts are in photos, so that a training can continue with another number of ranks; `batch` is the photos of a
     step.
     """
-    states = {prefix: optimizer.state.get(parameter, {}) for prefix, parameter in _parameters_by_name(optimizer)}
     return {
         f"{prefix}{key}": value * batch if key == "step" and batch > 1 else value
-        for prefix, state in states.items()
-        for key, value in state.items()
+        for prefix, parameter in _parameters(optimizer)
+        for key, value in optimizer.state.get(parameter, {}).items()
     }
 
 
 def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: int = 1) -> None:
     """Continue from optimizer_tensors()."""
-    for prefix, parameter in _parameters_by_name(optimizer):
+    for prefix, parameter in _parameters(optimizer):
         if state := under(tensors, prefix):
             optimizer.state[parameter] = {
                 key: value.to(parameter.device, copy=True).reshape(() if key == "step" else parameter.shape)
@@ -159,7 +148,7 @@ def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: i
             optimizer.state[parameter]["step"] /= batch
 
 
-def _parameters_by_name(optimizer: Adam) -> Iterator[tuple[str, Tensor]]:
+def _parameters(optimizer: Adam) -> Iterator[tuple[str, Tensor]]:
     """Yield a name prefix and a parameter for each parameter of an optimizer."""
     for group in optimizer.param_groups:
         for index, parameter in enumerate(group["params"]):

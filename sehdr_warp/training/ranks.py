@@ -11,7 +11,7 @@ import pickle
 import platform
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import partial
@@ -149,16 +149,8 @@ class Ranks:
                 dist.broadcast(tensor, 0)
         self._deadline = time.monotonic() + self._timeout
 
-    def refine_on_main(
-        self, refine: Callable[[], bool], strategy: Strategy, gaussians: Gaussians, optimizer: Adam
-    ) -> bool:
-        """Refine the Gaussians on rank 0 and send them, with their optimizer state, to the others.
-
-        Returns:
-            What refine() returned on rank 0.
-        """
-        self.reduce_to_main(list(strategy.state_dict(gaussians.count).values()))
-        changed = self.is_main_process and refine()
+    def broadcast_refined(self, changed: bool, strategy: Strategy, gaussians: Gaussians, optimizer: Adam) -> bool:
+        """Replace Gaussians and optimizer state by those that rank 0 refined; return what it passes as `changed`."""
         values = [changed, gaussians.count, bool(strategy.state_dict(gaussians.count))]
         values = torch.tensor(values, dtype=torch.int64, device=self.device)
         self.broadcast([values])

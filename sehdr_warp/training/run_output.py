@@ -36,17 +36,14 @@ MAX_DB = 100.0  # Score of identical images, so that a mean over views is finite
 class RunOutput:
     """Evaluates, logs and saves a training."""
 
-    def __init__(self, folder: RunWriter, *, tensorboard: bool = False, is_block: bool = False):
-        """Prepare to write to a run folder, which need not exist yet, and event files if `tensorboard`.
+    def __init__(self, folder: RunWriter, config: Config, *, tensorboard: bool = False, is_block: bool = False):
+        """Prepare to write a training with a config to its run folder, and event files if `tensorboard`.
 
         The photos of a block of a larger run (`is_block`) are not compared with it at the end.
         """
         self.folder, self._is_block, self._tensorboard = folder, is_block, tensorboard
-        self._writer: Any = None  # Created at the first log, when the run folder has been begun.
+        self._writer: Any = None  # Created at the first log
         self._run: Run | None = None
-
-    def start(self, config: Config) -> None:
-        """Decide when a training with this config evaluates, saves and logs; its Trainer calls this."""
         self._evaluate_at = {config.scaled(n) for n in config.schedule.evaluate_at}
         is_default = config.schedule.checkpoint_every == ScheduleConfig().checkpoint_every
         is_set = not is_default or "schedule.checkpoint_every" in config.plan.keep

@@ -100,18 +100,18 @@ def create_trainer(
     device, config = pick_device(device), as_config(config)
     if tensorboard:
         summary_writer()
-    output = RunOutput(RunWriter(out), tensorboard=tensorboard, is_block=shared is not None)
-    folder = output.folder
+    folder = RunWriter(out)
     with oom_context(device, lambda: sizes_of(scene), TRAINING_REMEDY):
         has_run = folder.prepare(resume=resume, overwrite=overwrite)  # Again, for those who call this function.
         try:
             if has_run:
                 if config is not None and not states_iterations:
                     config = with_iterations_of(folder.read_config(), config)
-                trainer = _resumed_trainer(scene, config, device, ranks, output)
+                trainer = _resumed_trainer(scene, config, device, ranks, folder)
             else:
                 config, data = config or Config(), data or LoadArguments()
-                trainer = _new_trainer(scene, config, device, ranks, output, data, shared, overwrite=overwrite)
+                trainer = _new_trainer(scene, config, device, ranks, folder, data, shared, overwrite=overwrite)
+            trainer.output = RunOutput(folder, trainer.config, tensorboard=tensorboard, is_block=shared is not None)
             if ranks is not None:
                 send_training(ranks, trainer, folder.read_info())
         except BaseException:
@@ -130,7 +130,7 @@ def _new_trainer(
     config: Config,
     device: torch.device,
     ranks: Ranks | None,
-    output: RunOutput,
+    folder: RunWriter,
     data: LoadArguments,
     shared: SharedDecisions | None,
     *,
@@ -154,24 +154,23 @@ def _new_trainer(
     photos = scene if compensation is None else compensation.normalize_photos(scene, response)
     get_matcher = cache(lambda: matcher or make_matcher(normalization.scene(photos), response, device))
     field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
-    trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks, output=output)
+    trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks)
     light = trainer.views.clipped_light_targets  # Estimated once, for this and for the loss.
     if light is not None and not config.model.init_file:
         brighten_clipped(field, normalization.scene(photos).train_views, light)
     trainer.seconds = time.perf_counter() - started
     # The folder is begun last, when the scene is known to be usable.
     plan_values, state = None if plan is None else plan.to_dict(), state_of(trainer)
-    output.folder.begin(scene, config, field, data, plan_values, state, compensation=compensation, overwrite=overwrite)
+    folder.begin(scene, config, field, data, plan_values, state, compensation=compensation, overwrite=overwrite)
     for line in plan.lines() if plan is not None else ():
         log.info("%s", line)
     return trainer
 
 
 def _resumed_trainer(
-    scene: Scene, config: Config | None, device: torch.device, ranks: Ranks | None, output: RunOutput
+    scene: Scene, config: Config | None, device: torch.device, ranks: Ranks | None, folder: RunWriter
 ) -> Trainer:
     """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run."""
-    folder = output.folder
     folder.lock()
     info, saved = folder.read_info(), folder.read_config()
     before = saved.schedule.iterations
@@ -191,7 +190,7 @@ def _resumed_trainer(
     compensation = exposure_compensation(info)
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     large_scene = checkpoint.values.get("large_scene")
-    trainer = Trainer(scene, saved, field, ranks=ranks, output=output, large_scene=large_scene)
+    trainer = Trainer(scene, saved, field, ranks=ranks, large_scene=large_scene)
     try:
         load_state(trainer, checkpoint)
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:

@@ -66,7 +66,7 @@ class Trainer:
         scene: The scene, with compensated photos.
         config: Options of the training.
         field: The radiance field that is trained.
-        output: Run folder to evaluate, log and save to; None to save nothing.
+        output: Run folder to evaluate, log and save to, which create_trainer() sets; None to save nothing.
         optimizer: Adam, over the field's parameters.
         strategy: The densification strategy.
         average: Moving average of the Gaussians.
@@ -87,7 +87,6 @@ class Trainer:
         *,
         get_matcher: Callable[[], Matcher] | None = None,
         ranks: Ranks | None = None,
-        output: RunOutput | None = None,
         large_scene: bool | None = None,
     ):
         """Prepare a training on the device of the field; create_trainer() does this for a scene and a run folder.
@@ -96,7 +95,8 @@ class Trainer:
         by default a new one. `ranks` train together. `large_scene` is that of a training that goes on, whose scene may
         lack points; by default scene_facts.is_large() of the scene.
         """
-        self.scene, self.config, self.field, self.ranks, self.output = scene, config, field, ranks, output
+        self.scene, self.config, self.field, self.ranks = scene, config, field, ranks
+        self.output: RunOutput | None = None
         rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)
         self.device = field.gaussians.means.device
         self.total = config.schedule.iterations
@@ -132,8 +132,6 @@ class Trainer:
         self.interrupted, self._stopped, self._ranks_ended = threading.Event(), False, False
         self._finished = False  # Whether the training came to its end, and its results are written
         self._seconds_per_iteration = 0.0  # Running mean
-        if output is not None:
-            output.start(config)
 
     # The loop
 
@@ -261,10 +259,13 @@ class Trainer:
         gaussians, strategy, ranks = self.field.gaussians, self.strategy, self.ranks
         count, reallocations = gaussians.count, gaussians.reallocations
         propose = self._propose_gaussians if self._can_seed else None
-        refine = partial(
-            strategy.refine, self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch
+        if ranks is not None:
+            ranks.reduce_to_main(list(strategy.state_dict(count).values()))
+        changed = (ranks is None or ranks.is_main_process) and strategy.refine(
+            self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch
         )
-        changed = refine() if ranks is None else ranks.refine_on_main(refine, strategy, gaussians, self.optimizer)
+        if ranks is not None:
+            changed = ranks.broadcast_refined(changed, strategy, gaussians, self.optimizer)
         if changed:
             self.graphs.adapt(count, reallocations, self.iteration)
 
