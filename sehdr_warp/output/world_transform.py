@@ -25,6 +25,7 @@ from ..runs.values import ORIENTATION_FILE
 from ..scene import Camera
 from ..scene.gravity import is_pitch_known, typical_roll, up_direction
 from ..splats import STREAMED_SOG
+from ..splats.arrays import LARGEST_SCALE, similarity
 from .cameras.scene_cameras import common_focus, middle_index, training_cameras
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ log = logging.getLogger(__name__)
 AXES = ("upright", "scene")
 Y_DOWN_SUFFIXES = (".ply", ".sog", ".spz")
 _WORST_ROLL = math.radians(12)  # Median roll about the common up above which the cameras are said to have none
-_LARGEST_SCALE = 1e6
 
 
 @dataclass(frozen=True)
@@ -59,16 +59,9 @@ class WorldTransform:
     @staticmethod
     def from_matrix(matrix: Any) -> "WorldTransform":
         """Return the transform of a 4 x 4 matrix that acts on column vectors; raise ValueError for another kind."""
-        values = np.array(matrix, np.float64)
-        if values.shape != (4, 4) or not np.isfinite(values).all() or not np.allclose(values[3], (0, 0, 0, 1)):
-            raise ValueError("is not an affine 4 x 4 matrix")
-        scale = np.cbrt(np.linalg.det(values[:3, :3]))
-        if not 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE:
-            raise ValueError("does not keep orientation or size")
-        rotation = values[:3, :3] / scale
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
-            raise ValueError("is not a rotation with one scale")
-        return WorldTransform(rotation, values[:3, 3], float(scale))
+        values = similarity(matrix)
+        scale = float(np.cbrt(np.linalg.det(values[:3, :3])))
+        return WorldTransform(values[:3, :3] / scale, values[:3, 3], scale)
 
     @property
     def matrix(self) -> np.ndarray:
@@ -276,7 +269,7 @@ def write_orientation(run: "RenderableScene", *, up: Sequence[float] | None = No
 def _checked_scale(scale: Any) -> float:
     if scale is None:
         return 1.0
-    if not isinstance(scale, int | float) or not 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE:
+    if not isinstance(scale, int | float) or not 1 / LARGEST_SCALE <= scale <= LARGEST_SCALE:
         raise SehdrError(f"scale {scale!r:.40} is not between 1e-6 and 1e6 meters for each unit of the scene")
     return float(scale)
 

@@ -19,6 +19,8 @@ HARMONIC_0 = 0.5 / math.sqrt(math.pi)
 MAX_DEGREE = 3
 SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
 """Seconds that a base exposure time may have; beyond, radiance leaves the range of float32."""
+LARGEST_SCALE = 1e6
+"""Of a transform between coordinates."""
 # A logit beyond this is an opacity of 0 or 1 in float32.
 _MOST_LOGIT = 20.0
 # Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.
@@ -258,21 +260,29 @@ def read_facts(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
             raise InputError(path, problem, "export it again")
         result["photo_focals"] = low, high
     if (matrix := facts.get("world_matrix")) is not None:
-        result["world_matrix"] = _similarity(matrix, path)
+        try:
+            values = json.loads(matrix) if isinstance(matrix, str) else matrix
+            result["world_matrix"] = similarity(np.reshape(np.array(values, np.float64), (4, 4)))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InputError(path, f"its world_matrix {error!s:.80}", "leave that entry out of the file") from None
     return result
 
 
-def _similarity(value: Any, path: Path) -> np.ndarray:
-    """Return a stored matrix [4, 4], JSON text or nested numbers; raise InputError if it is not a similarity."""
-    try:
-        matrix = np.array(json.loads(value) if isinstance(value, str) else value, np.float64).reshape(4, 4)
-        square = matrix[:3, :3] @ matrix[:3, :3].T
-        one_scale = np.allclose(square, np.eye(3) * np.trace(square) / 3, rtol=1e-4, atol=1e-4 * np.trace(square))
-        if one_scale and np.linalg.det(matrix[:3, :3]) > 0 and (matrix[3] == (0, 0, 0, 1)).all():
-            return matrix
-    except (ValueError, TypeError, RecursionError):
-        pass
-    raise InputError(path, "its world_matrix is not a similarity", "leave that entry out of the file")
+def similarity(matrix: Any) -> np.ndarray:
+    """Return a matrix [4, 4] float64 that acts on column vectors: a proper rotation, a translation and one scale.
+
+    Raises ValueError for another kind, or a scale outside 1e-6 to 1e6.
+    """
+    values = np.array(matrix, np.float64)
+    if values.shape != (4, 4) or not np.isfinite(values).all() or not np.allclose(values[3], (0, 0, 0, 1)):
+        raise ValueError("is not an affine 4 x 4 matrix")
+    scale = np.cbrt(np.linalg.det(values[:3, :3]))
+    if not 1 / LARGEST_SCALE <= scale <= LARGEST_SCALE:
+        raise ValueError("does not keep orientation or size")
+    rotation = values[:3, :3] / scale
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+        raise ValueError("is not a rotation with one scale")
+    return values
 
 
 def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:
