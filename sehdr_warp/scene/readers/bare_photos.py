@@ -43,6 +43,7 @@ _POSE_FILES = {
     "mesh_info.json": "Polycam", "metadata.json": "Record3D", "arposes.txt": "ARKit", "cams": "MVSNet",
     "cameras_sphere.npz": "NeuS", "cameras.npz": "IDR", "pose": "NSVF", "camera": "Nerfies", "dslr": "ScanNet++",
     "groundtruth.txt": "TUM", "traj.txt": "Replica", "images.lst": "RealityScan",
+    "_par.txt": "Middlebury",
 }  # fmt: skip
 # By suffix what files of any name hold that state cameras.
 _POSE_CONTENT = {
@@ -52,6 +53,7 @@ _POSE_CONTENT = {
 _MEDIA = frozenset().union(VIDEO_SUFFIXES, UNSTITCHED_SUFFIXES, HEIF_SUFFIXES)  # May be meant beside a folder of photos
 _CAMERA_FOLDER = re.compile(r"\d{6}_[a-z_]|\d{3}([a-z0-9_]{5})")  # 202410__ of an iPhone, and 100CANON
 _ALIKE = 5.0  # Degrees; 1.8 between sets of 9 photos of which one has 49 points, 8 and more if people or objects move
+_MIDDLEBURY = re.compile(r".*_par\.txt")  # templeR_par.txt
 _MOST_READ = 20  # Files of one suffix whose content is looked at
 _CAMERA_FILES = ("transforms.json", "reconstruction.json", "poses_bounds.npy")  # Beside a folder of photos
 
@@ -146,8 +148,10 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
         place = reconstruct_panoramas if are_panoramas(photos) else partial(_reconstruct, masks=masks)
         reconstruction = place(photos, cache)
     except InputError as error:
-        if poses := _foreign_poses(folder):
-            raise InputError(error.path, error.problem, poses[0]) from None
+        inner = _folders_with_photos(folder) if photos[0].parent == folder else []
+        hints = [f"if the photos are in a folder of it, give that: {first_names(inner, 5)}"] if inner else []
+        if hints := hints + _foreign_poses(folder)[:1]:
+            raise InputError(error.path, error.problem, "; ".join(hints)) from None
         raise
     model, placed, unplaced = reconstruction.model, [], []
     cameras = {int(Path(image.name).stem): image for image in model.images}
@@ -307,7 +311,8 @@ def _cameras_above(folder: Path) -> list[str]:
 def _foreign_poses(folder: Path) -> list[str]:
     """Return a note on poses of other programs beside bare photos: they are not read, and cameras are found anew."""
     entries = sorted(folder.iterdir())
-    tools = [f"{tool} ({file.name})" for file in entries if (tool := _POSE_FILES.get(file.name.lower()))]
+    names = ((file.name, _MIDDLEBURY.sub("_par.txt", file.name.lower())) for file in entries)
+    tools = [f"{tool} ({name})" for name, key in names if (tool := _POSE_FILES.get(key))]
     for suffix, (mark, tool) in sorted(_POSE_CONTENT.items()):
         files = (file for file in entries if file.suffix.lower() == suffix and file.name.lower() not in _POSE_FILES)
         file = next((file for file in itertools.islice(files, _MOST_READ) if _has_near_its_start(file, mark)), None)

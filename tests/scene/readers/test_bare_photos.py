@@ -133,6 +133,7 @@ def test_fewer_pictures_of_results_lie_beside_the_photos(tmp_path):
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
     ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"), ("frame_00000.json", "3D Scanner App"),
+    ("dinoSR_par.txt", "Middlebury"),
 ])  # fmt: skip
 def test_poses_of_other_programs_are_named(tmp_path, file, tool):
     photos(tmp_path)
@@ -157,6 +158,9 @@ def test_poses_of_other_programs_are_the_remedy_if_cameras_are_not_found(tmp_pat
     photos(tmp_path, 3)
     files(tmp_path, "cameras.xml")
     with pytest.raises(InputError, match=r"be placed.*; poses of Metashape \(cameras.xml\).*nerfstudio"):
+        parse_dataset(tmp_path)
+    photos(tmp_path / "shots", 4)  # The others may be pictures of results.
+    with pytest.raises(InputError, match=r"be placed.*; if the photos are in a folder of it, give that: shots; poses"):
         parse_dataset(tmp_path)
 
 
