@@ -140,7 +140,7 @@ def advice(
             lines.append(
                 f"{train_photos} photos are few: more from places between them, and nearer, would help most: {again}"
             )
-    if gain < UNFINISHED:
+    if gain < UNFINISHED and len(points) not in (1, 2):  # Too few to show whether blur is still going away.
         if jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
             lines.append(jump)
         elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.

@@ -91,17 +91,14 @@ class Matcher:
         self._photos = PhotoSet.of(self._images, cameras, neighbors, device)
         poses = np.stack([camera.camera_to_world for camera in cameras])
         self._poses = torch.tensor(poses, dtype=torch.float32, device=device)
-        self._set_depths(np.geomspace(focus * RANGE[1], focus * RANGE[0], PLANES[1]))
-        depths = self.match(self.pixels(PROBES, np.random.default_rng(0))).footprints * float(cameras[0].fx)
+        depths = np.geomspace(focus * RANGE[1], focus * RANGE[0], PLANES[1])
+        self._depths = torch.tensor(depths, dtype=torch.float32, device=device)
+        probes = self.match(self.pixels(PROBES, np.random.default_rng(0))).footprints * float(cameras[0].fx)
         near, far = (part * focus for part in GUESS)
-        if len(depths) >= FEWEST_FOUND:
-            near, far = (float(depths.quantile(part)) * slack for part, slack in zip((0.01, 0.99), SLACK, strict=True))
+        if len(probes) >= FEWEST_FOUND:
+            near, far = (float(probes.quantile(part)) * slack for part, slack in zip((0.01, 0.99), SLACK, strict=True))
         planes = int(np.clip(_parallax(cameras, neighbors, near, far), *PLANES))
-        self._set_depths(1 / np.linspace(1 / far, 1 / near, planes))
-
-    def _set_depths(self, depths: np.ndarray) -> None:
-        """Set the depths [D] to try."""
-        self._depths = torch.tensor(depths, dtype=torch.float32, device=self.device)
+        self._depths = torch.tensor(1 / np.linspace(1 / far, 1 / near, planes), dtype=torch.float32, device=device)
 
     def pixels(self, count: int, rng: np.random.Generator) -> Tensor:
         """Choose about `count` pixels, one from each square of equal size, by gradients and brightness.

@@ -84,6 +84,7 @@ def test_a_training_that_is_too_short_blames_nothing_that_moved():
     for decibels in ([20, 22, 24], [28, 28, 28.3]):
         [line] = advice(Path("r"), summary(decibels, regions=100), 10)
         assert "more steps help" in line
+    assert advice(Path("r"), summary([12, 13], regions=100) | {"brightness_offsets": {"p0": 0.9}}, 10) == []
 
 
 def test_few_photos_and_movement():
