@@ -1,6 +1,6 @@
-"""Write the report page of the prior for clipped light from the figures of `priors.judge`.
+"""Write the report page of the prior for clipped light from the figures of `priors.judge` and `priors.brackets`.
 
-python -m priors.report FIGURES.json docs
+python -m priors.report FIGURES.json BRACKETS.json docs
 """
 
 import json
@@ -56,17 +56,31 @@ that clip in a photo of 96 x 96 pixels. Trainings count half of the variance, so
 | photos | {areas} |
 | --- |{rules}
 {energies}
+
+## Photos by real cameras
+
+{photos} photos of {stacks} exposure stacks by other people, which no training used (`python -m priors.brackets`). Each
+stack calibrates its camera, and its darker photos show what clips in the others. Stacks count alike. *RMS* and *bias*
+are of clipped values, in stops; *light* is the median error of their sum, log2.
+
+| pixels that clip | photos (stacks) | RMS of white | RMS | bias | within one deviation | light of white | light |
+| --- | -: | -: | -: | -: | -: | -: | -: |
+{brackets}
+
+A light's color is hardly known: the estimate has {slope:.2f} of the stops between red and blue, as its correlation with
+the truth, {correlation:.2f}, calls for. So lights that clip in all channels come out pale.
 """
 
 
-def main(figures_file: Path, folder: Path, /) -> None:
+def main(figures_file: Path, brackets_file: Path, folder: Path, /) -> None:
     """Write page and plot of the prior.
 
     Args:
         figures_file: JSON file of priors.judge.
+        brackets_file: JSON file of priors.brackets.
         folder: docs.
     """
-    figures = json.loads(figures_file.read_text())
+    figures, brackets = (json.loads(file.read_text()) for file in (figures_file, brackets_file))
     tables = "\n\n".join(
         f"**{name}: {title}**\n\n{_table(figures[name])}" for name, title in _SETS.items() if name in figures
     )
@@ -76,6 +90,9 @@ def main(figures_file: Path, folder: Path, /) -> None:
     energies = [f"| {name} | {' | '.join(f'{row[area]:.2f}' for area in _AREAS)} |" for name, row in ratios.items()]
     values = {"page": PAGE, "tables": tables, "within": network["within_one_deviation"], "quarters": "\n".join(rows)}
     values |= {"areas": " | ".join(_AREAS.values()), "rules": " -: |" * len(_AREAS), "energies": "\n".join(energies)}
+    values |= {"brackets": _bracket_rows(brackets["rows"]), **brackets["colors"]}
+    photos = [photo["stack"] for photo in brackets["photos"]]
+    values |= {"photos": len(photos), "stacks": len(set(photos))}
     (folder / f"{PAGE}.md").write_text(_TEXT.format(**values))
     _plot(np.array(network["sample"]), folder / "images" / f"{PAGE}.png")
 
@@ -85,6 +102,15 @@ def _table(estimates: dict) -> str:
     for name, row in estimates.items():
         lines.append(f"| {name} | {' | '.join(f'{row[column]:.2f}' for column in _COLUMNS)} |")
     return "\n".join(lines)
+
+
+def _bracket_rows(rows: list[dict]) -> str:
+    return "\n".join(
+        f"| {row['least']:.1%} to {row['most']:.1%} | {row['photos']} ({row['stacks']}) | {row['white_rms']:.2f} "
+        f"| {row['rms']:.2f} | {row['bias']:+.2f} | {row['within']:.0%} | {row['white_light']:.2f} "
+        f"| {row['light']:.2f} |"
+        for row in rows
+    )
 
 
 def _plot(sample: np.ndarray, path: Path) -> None:
