@@ -17,7 +17,6 @@ from .exposure.times import choose_exposure, exposures_note, with_exposure_times
 from .file_names import image_folder, unique_names
 from .float_photos import with_float_times
 from .masks import assign_masks
-from .photo_names import photo_labels
 from .photos import usable_photos
 from .pose_conventions import POSED, with_fitting_cameras
 from .preprocess import preprocess
@@ -114,13 +113,11 @@ def load_scene(
         names = [names[index] for index in indices]
         dataset = replace(dataset, records=tuple(dataset.records[index] for index in indices))
     scene = preprocess(dataset, curve, max_size, photo_storage, names)
-    labels = photo_labels([record.image for record in dataset.records])
-    named_views = zip(names, labels, dataset.records, strict=True)
-    guessed = {name: label for name, label, record in named_views if not record.time_known}
+    guessed = {name: record for name, record in zip(names, dataset.records, strict=True) if not record.time_known}
     if guessed and cameras:  # The training estimated them by points of structure from motion, which are not here.
-        run_times = {camera.file: camera.exposure_time for camera in cameras}
-        times = {name: run_times[file] for name, file in guessed.items() if file in run_times}
-        timed = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
+        run_times = {camera.world_to_camera.tobytes(): camera.exposure_time for camera in cameras}
+        times = {name: run_times.get(record.world_to_camera.tobytes()) for name, record in guessed.items()}
+        timed = (replace(view, exposure_time=times.get(view.name) or view.exposure_time) for view in scene.views)
         scene = replace(scene, views=tuple(timed))
     elif guessed:
         from .exposure.estimate import with_estimated_times

@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.scene.dataparser import PlacedPhoto
 from sehdr_warp.scene.exposure.times import shutter
 from sehdr_warp.scene.images.exif import parse_number
 from sehdr_warp.scene.lens import Lens
-from sehdr_warp.scene.load import parse_dataset
-from tests.make_scenes import edited_json, load, write_blender, write_colmap
+from sehdr_warp.scene.load import load_scene, parse_dataset
+from tests.make_scenes import arc_poses, edited_json, load, pattern, write_blender, write_colmap
 
 TIME, NUMBER, ISO, APEX = 33434, 33437, 34855, 37377
 
@@ -213,3 +215,15 @@ def test_listed_times_under_other_spellings(tmp_path, name):
     scene = load(tmp_path, holdout=0)
     assert [view.exposure_time for view in scene.views] == pytest.approx(list(times.values()))
     assert not [note for note in scene.notes if "exposures.json" in note]
+
+
+def test_a_run_keeps_the_times_that_it_estimated_if_its_photos_are_renamed(tmp_path):
+    """Disks of cameras change the case of names."""
+    lens, cameras = Lens("SIMPLE_PINHOLE", 32, 24, (30.0, 16.0, 12.0), tmp_path), []
+    for i, pose in enumerate(arc_poses(5)):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({0x829A: 0.01} if i else {})
+        Image.fromarray(pattern(32, 24, i)).save(tmp_path / f"img_{i}.jpg", exif=exif)
+        cameras.append(PlacedPhoto(f"IMG_{i}.JPG", lens, pose, "train", 0.01 if i else 0.04))
+    scene = load_scene(tmp_path, response="srgb", cameras=cameras)
+    assert [view.exposure_time for view in scene.views] == pytest.approx([0.04] + [0.01] * 4)
