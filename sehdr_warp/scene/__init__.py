@@ -13,7 +13,6 @@ load.py leads from a data folder to a Scene (types.py). In the order of its work
 
 from .camera import Camera, look_at
 from .load import embedded_folder, embedded_scenes, is_embedded, load_scene, parse_dataset
-from .preprocess import preprocess
 from .readers.camera_files import load_cameras
 from .types import Scene, View, codes_of, encoded_values
 
@@ -30,5 +29,4 @@ __all__ = [
     "load_scene",
     "look_at",
     "parse_dataset",
-    "preprocess",
 ]

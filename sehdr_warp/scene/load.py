@@ -112,7 +112,7 @@ def load_scene(
             raise InputError(path, problem, "put the photos back as they were")
         names = [names[index] for index in indices]
         dataset = replace(dataset, records=tuple(dataset.records[index] for index in indices))
-    scene = preprocess(dataset, curve, max_size, photo_storage, names)
+    scene = preprocess(dataset, curve, names, max_size, photo_storage)
     guessed = {name: record for name, record in zip(names, dataset.records, strict=True) if not record.time_known}
     if guessed and cameras:  # The training estimated them by points of structure from motion, which are not here.
         run_times = {camera.world_to_camera.tobytes(): camera.exposure_time for camera in cameras}
@@ -290,7 +290,7 @@ def is_embedded(path: Path | str) -> bool:
 
 def embedded_scenes() -> tuple[str, ...]:
     """List the names that load_scene("embedded:NAME") finds: room, and others of a checkout or $SEHDR_SCENES."""
-    return tuple(sorted({path.parent.name for place in _places() for path in place.glob(f"*/{_MARK}")}))
+    return tuple(sorted(_embedded_folders()))
 
 
 def embedded_folder(path: str) -> Path:
@@ -299,17 +299,16 @@ def embedded_folder(path: str) -> Path:
     Raises:
         InputError: if it is not here.
     """
-    name = str(path).partition(":")[2] or "room"
-    if name in embedded_scenes():
-        return next(place / name for place in _places() if (place / name / _MARK).is_file())
-    scenes = embedded_scenes()
-    present = ", ".join(f"embedded:{each}" for each in scenes)
-    problem = f"is not here{did_you_mean(name, scenes)}; present are {present}"
+    name, folders = str(path).partition(":")[2] or "room", _embedded_folders()
+    if name in folders:
+        return folders[name]
+    present = ", ".join(f"embedded:{each}" for each in sorted(folders))
+    problem = f"is not here{did_you_mean(name, folders)}; present are {present}"
     raise InputError(path, problem, "get the repository's scenes/ and name it in SEHDR_SCENES")
 
 
-def _places() -> list[Path]:
-    """List the folders of scenes: in the package, in $SEHDR_SCENES, and in scenes/ beside a checkout's package."""
-    package = Path(str(resources.files("sehdr_warp")))
-    scenes_folder = os.environ.get("SEHDR_SCENES")
-    return [package / "embedded", *([Path(scenes_folder)] if scenes_folder else []), package.parent / "scenes"]
+def _embedded_folders() -> dict[str, Path]:
+    """Return embedded scenes by name: of the package, else of $SEHDR_SCENES, else of a checkout's scenes/."""
+    package, other = Path(str(resources.files("sehdr_warp"))), os.environ.get("SEHDR_SCENES")
+    places = [package.parent / "scenes", *([Path(other)] if other else []), package / "embedded"]
+    return {path.parent.name: path.parent for place in places for path in place.glob(f"*/{_MARK}")}

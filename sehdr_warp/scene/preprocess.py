@@ -18,7 +18,6 @@ from .color.encoding import DEVIATION, ColorEncoding
 from .color.primaries import linear_to_srgb
 from .color.srgb_codes import FloatTable, bands_of
 from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
-from .file_names import unique_names
 from .float_photos import float_codes
 from .images.downsampling import area_average
 from .images.gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
@@ -45,9 +44,9 @@ _PIXELS_AT_ONCE = 64_000_000  # Pixels of the photos that are read in parallel, 
 def preprocess(
     dataset: DataparserOutputs,
     response: "Response",
+    names: Sequence[str],
     max_size: int | None = None,
     photo_storage: str = "auto",
-    names: Sequence[str] | None = None,
 ) -> Scene:
     """Undistort and resize the photos of a dataset.
 
@@ -56,16 +55,15 @@ def preprocess(
     Args:
         dataset: what parse_dataset returned.
         response: decodes codes to the light in which averages are taken.
+        names: of the views.
         max_size: longest side of the views in pixels; None keeps the photos' sizes.
         photo_storage: where views are stored, see PhotoKeeper.
-        names: of the views; by default unique_names() of the records.
 
     Raises:
         InputError: if a file is damaged, sizes disagree, or the photos show nothing but black or white.
     """
     to_rec709 = dataset.color_matrix if dataset.within_rec709 else None
     preprocessor = _Preprocessor(max_size, response, dataset.alpha, to_rec709)
-    names = unique_names(dataset.records) if names is None else names
     keeper = PhotoKeeper(
         photo_storage, len(names), sum(record.lens.width * record.lens.height for record in dataset.records)
     )

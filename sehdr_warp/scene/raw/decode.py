@@ -18,7 +18,7 @@ from ..color.primaries import linear_to_srgb
 from ..images.ldr_files import EncodedImage, check_size, require_file
 from ..types import codes_of
 from .dng import DngRaw, read_dng
-from .dng_develop import CLIPPED, clipping_level, develop_dng
+from .dng_develop import CLIPPED, clipping_level, develop_dng, linear_colors
 
 _XYZ_FROM_REC709 = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
@@ -101,10 +101,6 @@ def read_raw(path: Path, *, oriented: bool) -> EncodedImage:
 
 def _develop(raw: Any, oriented: bool) -> np.ndarray:
     """Return [H, W, 3] float32 light of an opened RAW file, 1 where a channel clips."""
-    import rawpy
-
-    options: dict[str, Any] = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "output_bps": 16}
-    options |= {"no_auto_bright": True, "user_wb": [1, 1, 1, 1], "adjust_maximum_thr": 0.0}
     levels, values, colors = np.ones(3), raw.raw_image_visible, raw.raw_colors_visible
     black, ranges = np.array(raw.black_level_per_channel, float), np.ones(3)
     for channel, members in enumerate(((0,), (1, 3), (2,))):
@@ -112,7 +108,7 @@ def _develop(raw: Any, oriented: bool) -> np.ndarray:
         levels[channel] = clipping_level(shares / (raw.white_level - black[channel]))
         # LibRaw divides all channels by the range of the one with the lowest black level.
         ranges[channel] = (raw.white_level - black.min()) / (raw.white_level - black[list(members)].mean())
-    linear = raw.postprocess(**options, user_flip=None if oriented else 0).astype(np.float32) / 65535
+    linear = linear_colors(raw, user_flip=None if oriented else 0)
     linear *= ranges.astype(np.float32)
     return np.where(linear >= CLIPPED * levels, 1, linear)
 

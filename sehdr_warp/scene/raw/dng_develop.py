@@ -146,9 +146,18 @@ def _demosaic(mosaic: np.ndarray, pattern: np.ndarray) -> np.ndarray:
         return np.broadcast_to(np.array([values[0] for values in channels], np.float32), (*mosaic.shape, 3))
     headroom = max(1.0, float(mosaic.max()))
     with rawpy.imread(io.BytesIO(_plain_dng(mosaic / headroom, pattern))) as raw:
-        options: dict[str, Any] = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "output_bps": 16}
-        options |= {"no_auto_bright": True, "user_wb": [1, 1, 1, 1], "adjust_maximum_thr": 0.0, "user_flip": 0}
-        return raw.postprocess(**options).astype(np.float32) * np.float32(headroom / 65535)
+        return linear_colors(raw, user_flip=0) * np.float32(headroom)
+
+
+def linear_colors(raw: Any, user_flip: int | None) -> np.ndarray:
+    """Return [H, W, 3] float32 in [0, 1] that LibRaw demosaics of an open file, in the sensor's colors as they are."""
+    import rawpy
+
+    options: dict[str, Any] = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "output_bps": 16}
+    options |= {"no_auto_bright": True, "user_wb": [1, 1, 1, 1], "adjust_maximum_thr": 0.0, "user_flip": user_flip}
+    linear = raw.postprocess(**options).astype(np.float32)
+    linear /= 65535
+    return linear
 
 
 def _plain_dng(mosaic: np.ndarray, pattern: np.ndarray) -> bytes:
