@@ -11,7 +11,6 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,7 @@ from .gsplat_trainer import GsplatScene, Snapshot, train_gsplat
 from .results import finish, new_result
 from .splats import Size, make_photo_scene, parse_size
 from .study import run
-from .timing import forget_peaks, held_memory, wait
+from .timing import forget_peaks, held_memory
 
 LOG = logging.getLogger("large")
 RESPONSE = "srgb"
@@ -79,7 +78,7 @@ def _train(scene: Scene, config: Config, device: str) -> dict:
     training = create_trainer(scene, scratch / "run", config, device=device)
     for step in training:
         if step.iteration == step.total // WARM_UP:
-            training.run_timed(partial(wait, training.device))
+            training.synchronize()
             begun = training.seconds
         memory = held_memory(training.device) or 0
     row = {"method": "sehdr-warp", "gaussians": training.run.gaussian_count, "seconds": training.seconds - begun}
