@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import packages_distributions, version
+from importlib.metadata import distributions
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -171,7 +171,7 @@ def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Pat
 def cache_key(*parts) -> str:
     """Name a result by all it depends on: `parts` (for JSON), constants here and of pairs, and pycolmap's version."""
     pairing = (EXHAUSTIVE_LIMIT, COMPARED_LIMIT, OVERLAP, FEATURES, PARTNERS, RATIO)
-    builds = sorted(version(name) for name in packages_distributions().get("pycolmap", ()))  # pycolmap-cuda12, too
+    builds = sorted({each.version for each in distributions() if str(each.name).startswith("pycolmap")})  # -cuda12, too
     key = [_VERSION, *builds, MAX_SIDE, SEED, FEWEST_SHARED, pairing, BRIGHTENING, *parts]
     return hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
 
