@@ -91,12 +91,11 @@ class FlatGradients:
     @torch.no_grad()
     def collect(self, loss: Tensor, overflow: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
         """Move the parameters' gradients to the buffer, with the numbers of the step."""
-        with_gradient = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        gradients = {k: value.grad for k, value in enumerate(self.parameters) if value.grad is not None}
         # Else the mean would hold gradients of an earlier step.
-        assert self._with_gradient in ([], with_gradient), "all steps have gradients of the same parameters"
-        self._with_gradient = with_gradient
-        gradients = [self.parameters[k].grad for k in self._with_gradient]
-        torch._foreach_copy_([self._views[k] for k in self._with_gradient], gradients)
+        assert self._with_gradient in ([], [*gradients]), "all steps have gradients of the same parameters"
+        self._with_gradient = [*gradients]
+        torch._foreach_copy_([self._views[k] for k in gradients], [*gradients.values()])
         self._degree = None
         if harmonics is not None:
             # The slots of other ranks are zero, so that the sum over the ranks gathers all.
