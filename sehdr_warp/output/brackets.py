@@ -117,7 +117,7 @@ def write_brackets(
         overwrite: Replace the files that an earlier call wrote.
 
     Raises:
-        SehdrError: For unusable exposures or self.
+        SehdrError: For unusable exposures or options.
         InputError: If a file would be replaced or a pixel is not finite.
     """
     writer = BracketWriter(

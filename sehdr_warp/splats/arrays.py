@@ -20,7 +20,7 @@ MAX_DEGREE = 3
 SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
 """Seconds that a base exposure time may have; beyond, radiance leaves the range of float32."""
 LARGEST_SCALE = 1e6
-"""Of a transform between coordinates."""
+"""Of an export; what was exported again has the product."""
 # A logit beyond this is an opacity of 0 or 1 in float32.
 _MOST_LOGIT = 20.0
 # Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.
@@ -172,7 +172,7 @@ class GaussianArrays:
             raise InputError(path, f"its arrays are of {sorted(lengths)} Gaussians", "export it again")
         if not SHORTEST_TIME <= self.base_time <= LONGEST_TIME:
             problem = f"its base exposure time is {self.base_time} s"
-            raise InputError(path, problem, "state a positive number of seconds")
+            raise InputError(path, problem, f"state one of {SHORTEST_TIME} to {LONGEST_TIME} s")
         logits = np.clip(self.opacity_logits, -_MOST_LOGIT, _MOST_LOGIT)
         log_scales = np.clip(self.log_scales, -_MOST_LOG_SCALE, _MOST_LOG_SCALE)
         clamped = replace(self, opacity_logits=logits, log_scales=log_scales)
@@ -248,36 +248,39 @@ def read_facts(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
         InputError: If focal lengths are not two positive numbers in order, or the matrix is not a similarity.
     """
     result: dict[str, Any] = {"base_time": math.nan}  # GaussianArrays.checked() refuses it.
-    with suppress(TypeError, ValueError):
+    with suppress(TypeError, ValueError, OverflowError):
         result["base_time"] = float(facts.get("base_exposure_time", 1.0))
     if (focals := facts.get("photo_focals")) is not None:
         try:
             low, high = map(float, json.loads(focals) if isinstance(focals, str) else focals)
-        except (TypeError, ValueError, RecursionError):
+        except (TypeError, ValueError, OverflowError, RecursionError):
             low, high = math.nan, math.nan
         if not 0 < low <= high < math.inf:
             problem = f"its focal lengths of the photos are {focals!s:.60}, not two positive numbers in order"
             raise InputError(path, problem, "export it again")
         result["photo_focals"] = low, high
     if (matrix := facts.get("world_matrix")) is not None:
+        values = np.full((4, 4), math.nan)
+        with suppress(TypeError, ValueError, OverflowError, RecursionError):
+            read = json.loads(matrix) if isinstance(matrix, str) else matrix
+            values = np.reshape(np.array(read, np.float64), (4, 4))
         try:
-            values = json.loads(matrix) if isinstance(matrix, str) else matrix
-            result["world_matrix"] = similarity(np.reshape(np.array(values, np.float64), (4, 4)))
-        except (TypeError, ValueError, RecursionError) as error:
-            raise InputError(path, f"its world_matrix {error!s:.80}", "leave that entry out of the file") from None
+            result["world_matrix"] = similarity(values)
+        except ValueError as error:
+            raise InputError(path, f"its world_matrix {error}", "leave that entry out of the file") from None
     return result
 
 
 def similarity(matrix: Any) -> np.ndarray:
     """Return a matrix [4, 4] float64 that acts on column vectors: a proper rotation, a translation and one scale.
 
-    Raises ValueError for another kind, or a scale outside 1e-6 to 1e6.
+    Raises ValueError for another kind, or a scale outside 1e-13 to 1e13.
     """
     values = np.array(matrix, np.float64)
     if values.shape != (4, 4) or not np.isfinite(values).all() or not np.allclose(values[3], (0, 0, 0, 1)):
         raise ValueError("is not an affine 4 x 4 matrix")
     scale = np.cbrt(np.linalg.det(values[:3, :3]))
-    if not 1 / LARGEST_SCALE <= scale <= LARGEST_SCALE:
+    if not 1e-13 <= scale <= 1e13:  # Two exports by LARGEST_SCALE, and rounding
         raise ValueError("does not keep orientation or size")
     rotation = values[:3, :3] / scale
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):

@@ -7,6 +7,7 @@ import numpy as np
 CODES = 256
 _ROUNDS = 12
 _SQRT_HALF = np.sqrt(0.5)
+_MOST = 1e15  # Harmonic whose square is well within float32, in which scipy measures distances
 _STEPS = (1 << 21) - 1  # Of each axis of a Morton curve
 
 
@@ -72,7 +73,7 @@ def palette(rows: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
     Rows are split into groups first, and each group gets a share of the palette by its number of rows and their spread.
     """
-    rows = np.ascontiguousarray(rows, np.float32)
+    rows = np.clip(rows, -_MOST, _MOST, dtype=np.float32)
     groups = max(1, int(np.sqrt(size) / 2))
     _, group = _k_means(rows, groups)
     counts = np.bincount(group, minlength=groups)

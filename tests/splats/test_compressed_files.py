@@ -7,6 +7,7 @@ import subprocess
 import sys
 import warnings
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,15 @@ def test_the_transform_is_stored(tmp_path, suffix):
     matrix = np.diag([2.0, 2.0, 2.0, 1.0])
     write_gaussians(tmp_path / f"a{suffix}", natural().transformed(matrix))
     np.testing.assert_allclose(read_gaussians(tmp_path / f"a{suffix}").world_matrix, matrix)
+
+
+def test_harmonics_beyond_the_square_root_of_float32_do_not_end_the_program(tmp_path):
+    original = natural()
+    harmonics = original.harmonics.copy()
+    harmonics[3:6, 1:] = 1e20, -3e38, 1e30
+    write_gaussians(tmp_path / "a.sog", replace(original, harmonics=harmonics))
+    read = read_gaussians(tmp_path / "a.sog")
+    assert read.count == original.count and (np.abs(read.harmonics[:, 1:]).max(axis=(1, 2)) > 1e14).sum() == 3
 
 
 @pytest.mark.parametrize("suffix", LOSSY_SUFFIXES)

@@ -1,4 +1,5 @@
 import json
+import re
 import struct
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.splats import SUFFIXES, GaussianArrays, path_is_lossy, read_gaussians, write_gaussians
 from sehdr_warp.splats.arrays import join_gaussians
 
@@ -264,9 +266,29 @@ def test_what_is_not_finite_is_left_out_and_odd_harmonics_are_refused(tmp_path, 
         read_gaussians(tmp_path / "e.ply")
 
 
-@pytest.mark.parametrize("matrix", [np.diag([1e-7, 1e-7, 1e-7, 1]), np.diag([1, 1, 1.0003, 1]), np.diag([1, 1, -1, 1])])
+@pytest.mark.parametrize("matrix", [np.diag([0, 0, 0, 1]), np.diag([1, 1, 1.0003, 1]), np.diag([1, 1, -1, 1])])
 def test_a_transform_that_cannot_be_undone_is_refused_as_the_file_is_read(tmp_path, matrix):
     """Where such a file was placed in the photos' coordinates, a plain ValueError ended the program."""
     write_gaussians(tmp_path / "a.ply", replace(gaussians(5), world_matrix=matrix.astype(float)))
     with pytest.raises(InputError, match=r"a\.ply: its world_matrix (does not keep|is not)"):
+        read_gaussians(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("scale", [1e6, 1e-6])
+def test_the_largest_scales_of_an_export_are_read_again_and_undone(tmp_path, scale):
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * Rotation.from_euler("xyz", [1.1, 0.4, 2.3]).as_matrix()
+    for part, world in ((1, matrix), (2, matrix @ matrix)):  # Exported, and exported again
+        write_gaussians(tmp_path / f"{part}.ply", replace(gaussians(5), world_matrix=world))
+        read = read_gaussians(tmp_path / f"{part}.ply")
+        undone = WorldTransform.from_matrix(read.world_matrix).inverse().matrix @ world
+        np.testing.assert_allclose(undone, np.eye(4), atol=1e-9)
+
+
+@pytest.mark.parametrize("comment", ["world_matrix [[1, 2]", "world_matrix [1]", "world_matrix [1" + 400 * "0" + "]"])
+def test_a_transform_that_is_no_matrix_is_named_in_plain_words(tmp_path, comment):
+    write_gaussians(tmp_path / "a.ply", replace(gaussians(5), world_matrix=np.diag([2.0, 2, 2, 1])))
+    content = re.sub(rb"world_matrix .*", comment.encode(), (tmp_path / "a.ply").read_bytes(), count=1)
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(InputError, match="its world_matrix is not an affine 4 x 4 matrix; leave"):
         read_gaussians(tmp_path / "a.ply")
