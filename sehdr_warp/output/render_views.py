@@ -236,4 +236,5 @@ def _camera_files(
 def shared_tone_map(run: "RenderableScene", cameras: Sequence[Camera]) -> ToneMap:
     """Return one tone map for all pictures of some cameras, fitted to a few small renders."""
     small = [camera.within(_FIT_SIZE) for camera in evenly(cameras, _FIT_VIEWS)]
-    return fit_tone_map([as_array(run.render(camera, average=False).hdr) for camera in small])
+    renders = [run.render(camera, average=False) for camera in small]
+    return fit_tone_map([as_array(each.hdr) for each in renders], [as_array(each.alpha) for each in renders])

@@ -35,7 +35,7 @@ FEWEST_PHOTOS = 3  # A training needs at least as many
 _MOST_EXPLAINED = 3  # Photos of which a note says why they cannot be used
 _SMALLEST, _LARGEST = 1 / 32, 8  # Size of a photo in parts of its camera's
 _LEAST_SQUARE = 0.01  # Part by which the sides of a pixel may differ and count as equal
-_KINDS = {"encoded": "photos of codes", "raw": "RAW photos", "float": "float images"}
+_KINDS = {"encoded": "JPEG and similar photos", "raw": "RAW photos", "float": "float images"}
 _ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
 
 

@@ -6,7 +6,7 @@ display's gamut, and mapping each channel alone would bleach them; the two are m
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -52,13 +52,23 @@ class ToneMap:
         return value * (1 + value / np.float32(self.white**2)) / (1 + value)
 
 
-def fit_tone_map(pictures: Iterable[np.ndarray]) -> ToneMap:
-    """Return one tone map for pictures of a scene, each [H, W, 3] linear Rec.709 radiance.
+def fit_tone_map(pictures: Sequence[np.ndarray], alphas: Sequence[np.ndarray | None] = ()) -> ToneMap:
+    """Return one tone map for pictures of a scene.
 
     Black scenes get the identity. Raises ValueError without pictures.
+
+    Args:
+        pictures: [H, W, 3] linear Rec.709 radiance each.
+        alphas: [H, W] coverage of each, or None. Where at least half of a pixel is empty, as around an object that was
+            cut out, it says nothing about the scene's key.
     """
-    # float64 before the logarithm: radiance may be small in its units.
-    values = np.concatenate([(np.maximum(np.asarray(p, np.float64), 0) @ LUMINANCE).ravel() for p in pictures])
+    parts = []
+    for picture, alpha in zip(pictures, alphas or [None] * len(pictures), strict=True):
+        # float64 before the logarithm: radiance may be small in its units.
+        luminance = np.maximum(np.asarray(picture, np.float64), 0) @ LUMINANCE
+        covered = None if alpha is None else np.asarray(alpha) > 0.5
+        parts.append(luminance.ravel() if covered is None or not covered.any() else luminance[covered])
+    values = np.concatenate(parts)
     values = values[np.isfinite(values) & (values > 0)]  # Writers refuse what is not finite, and say where.
     if not values.size:
         return ToneMap(1.0, 1.0)

@@ -34,6 +34,7 @@ class Comparison:
         truth: HDR truth, if the scene has it.
         confidence: [H, W] in [0, 1] of the render, if it was measured.
         new: Rendered half-way to the nearest other view, if there is one.
+        alpha, new_alpha: [H, W] coverage of `hdr` and `new`.
     """
 
     name: str
@@ -45,6 +46,8 @@ class Comparison:
     truth: np.ndarray | None = None
     confidence: np.ndarray | None = None
     new: np.ndarray | None = None
+    alpha: np.ndarray | None = None
+    new_alpha: np.ndarray | None = None
 
     @property
     def scale(self) -> float:
@@ -90,12 +93,21 @@ def opening_of(comparison: Comparison) -> Opening:
 
 def compare(run: "RenderableScene", view: View, views: Sequence[View]) -> Comparison:
     """Render a view of a run and compare it with its photo; `views` are all views of the scene."""
-    confidence, hdr, new = run.render_confidence(view.camera), as_array(run.render(view.camera).hdr), None
+    confidence, render, new = run.render_confidence(view.camera), run.render(view.camera), None
     others = [other.camera for other in views if other.name != view.name]
     if others:
         nearest = min(others, key=lambda camera: float(np.linalg.norm(camera.position - view.camera.position)))
-        new = as_array(run.render(interpolate([view.camera, nearest], 3)[1]).hdr)
-    confidence = None if confidence is None else as_array(confidence)
-    pictures = photo_for_display(run, view), photo_light(run, view), hdr
-    gain = display_gain(run.response)
-    return Comparison(view.name, *pictures, view.exposure_time, gain, view.hdr, confidence, new)
+        new = run.render(interpolate([view.camera, nearest], 3)[1])
+    return Comparison(
+        view.name,
+        photo=photo_for_display(run, view),
+        from_photo=photo_light(run, view),
+        hdr=as_array(render.hdr),
+        exposure_time=view.exposure_time,
+        gain=display_gain(run.response),
+        truth=view.hdr,
+        confidence=None if confidence is None else as_array(confidence),
+        new=None if new is None else as_array(new.hdr),
+        alpha=as_array(render.alpha),
+        new_alpha=None if new is None else as_array(new.alpha),
+    )

@@ -20,6 +20,16 @@ def test_tone_map_and_stops_do_not_depend_on_the_unit_of_radiance():
     np.testing.assert_allclose(expose(image * 1e-3, -1, scale=3.0), encode_srgb(image * 1.5e-3), atol=1e-6)
 
 
+def test_the_empty_ground_of_a_cut_out_object_does_not_count():
+    """Faint haze around an object would make the object white."""
+    object_alone = radiance(64, 64)
+    picture, alpha = np.full((64, 320, 3), 1e-3, np.float32), np.full((64, 320), 0.01)
+    picture[:, :64], alpha[:, :64] = object_alone, 1.0
+    assert fit_tone_map([picture], [alpha]) == fit_tone_map([object_alone])
+    assert fit_tone_map([picture]).scale > 10 * fit_tone_map([object_alone]).scale
+    assert fit_tone_map([picture], [0.1 * alpha]) == fit_tone_map([picture])  # Nothing is more than half covered.
+
+
 def test_tone_map_uses_the_display():
     image = radiance(64, 64)
     display = fit_tone_map([image])(image)

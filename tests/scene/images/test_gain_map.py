@@ -361,7 +361,7 @@ def test_long_metadata_take_no_long_time(tmp_path, text):
     write_jpeg_pair(tmp_path / "a.jpg", base, gain, [(marker, body + (text * (64000 // len(text))).encode()[:64000])])
     started = time.process_time()
     assert read_gain_map(tmp_path / "a.jpg") is not None
-    assert time.process_time() - started < 3
+    assert time.process_time() - started < 1
 
 
 def test_values_as_elements_and_sequences(tmp_path):

@@ -190,7 +190,7 @@ def test_raw_beside_jpegs_of_the_same_shots_is_named_with_what_to_give(tmp_path)
         Image.fromarray(np.full((64, 64, 3), 90 + 40 * i, np.uint8)).save(tmp_path / f"{i}.jpg")
     photos, kind, (note,) = usable_photos(find_photos(tmp_path).records)
     assert kind == "encoded" and [photo.image.suffix for photo in photos] == [".jpg"] * 3
-    assert "because as many are photos of codes" in note and note.endswith("give a folder of RAW alone")
+    assert "because as many are JPEG and similar photos" in note and note.endswith("give a folder of RAW alone")
 
 
 def test_raw_photos_of_two_cameras_are_refused_before_they_are_matched(tmp_path, monkeypatch):
