@@ -115,7 +115,10 @@ class PagedField(RadianceField):
         levels = self.levels(None, position)
         if options.get("shares") is not None:
             options["shares"] = options["shares"].cpu()[self._rows(levels)].to(self.render_device)
-        return self._part(levels).render_directions(position, directions, **options)
+        part = self._part(levels)
+        if self.confidence is not None:  # Gathered here alone: other pictures of millions of Gaussians do not need it.
+            part.confidence = self.confidence.cpu()[self._rows(levels)].to(self.render_device)
+        return part.render_directions(position, directions, **options)
 
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
         """Return radiance on the CPU, as RadianceField.radiance_towards; cells are computed one after the other."""
@@ -147,8 +150,6 @@ class PagedField(RadianceField):
         joined = {name: torch.cat([page[name] for page in pages]) for name in pages[0]}
         part = RadianceField(Gaussians(**joined), self.response, fusion=self.fusion, **_options(self))
         part.requires_grad_(False)
-        if self.confidence is not None:
-            part.confidence = self.confidence[self._rows(levels)].to(self.render_device)
         return part
 
     def _page(self, key: tuple[int, int]) -> dict[str, Tensor]:
