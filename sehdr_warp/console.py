@@ -5,6 +5,7 @@ terminal.
 """
 
 import logging
+import math
 import sys
 import time
 from collections import deque
@@ -72,8 +73,9 @@ def run_with_progress(steps: Iterable[Any], total: int) -> None:
             psnrs.append(step.psnr)
             if terminal or now >= show_due or step.iteration >= total:
                 rate = (step.iteration - start[0]) / max(now - start[1], 1e-9)
-                loss, psnr = sum(losses) / len(losses), sum(psnrs) / len(psnrs)
-                show(step, rate=rate, loss=loss, psnr=psnr)
+                usable = [value for value in psnrs if math.isfinite(value)]  # A photo that its mask excludes has none.
+                psnr = sum(usable) / len(usable) if usable else math.nan
+                show(step, rate=rate, loss=sum(losses) / len(losses), psnr=psnr)
                 show_due = now + LINE_INTERVAL
             reading = time.monotonic() - now
             read_due = time.monotonic() + max(read_interval, min(reading / MAX_READING_SHARE, LINE_INTERVAL))

@@ -2,6 +2,7 @@
 
 import io
 import logging
+import math
 import re
 from types import SimpleNamespace
 
@@ -76,8 +77,8 @@ def test_debug_names_the_logger(monkeypatch):
     assert stream.getvalue() == "sehdr_warp.scene: a detail\n"
 
 
-def test_psnr_is_a_running_mean(monkeypatch):
-    values, stream, clock = iter([10.0, 20.0, 30.0] * 100), io.StringIO(), iter(range(100_000))
+def test_psnr_is_a_running_mean_of_photos_that_have_one(monkeypatch):
+    values, stream, clock = iter([10.0, 20.0, 30.0, math.nan] * 100), io.StringIO(), iter(range(100_000))
 
     class Uneven(Step):
         psnr = property(lambda self: next(values))

@@ -1,6 +1,7 @@
 """A training as the viewer shows it: pictures are made between its steps, by the thread that trains."""
 
 import logging
+import math
 import queue
 import threading
 import time
@@ -143,6 +144,8 @@ class LiveTraining(ViewerScene):
 
     def _tell(self, step: Any, elapsed: float) -> None:
         figures = {"loss": step.loss, "psnr": step.psnr, "gaussians": step.gaussians}
+        # JSON has no NaN: a loss may be it, and the PSNR of a photo that its mask excludes.
+        figures = {key: value if math.isfinite(value) else None for key, value in figures.items()}
         self._curve.append((step.iteration, *figures.values()))
         if len(self._curve) > MOST_POINTS:
             self._curve = self._curve[::2]

@@ -3,6 +3,7 @@
 import http.client
 import io
 import json
+import math
 import re
 import threading
 import time
@@ -135,6 +136,15 @@ def test_pictures_take_their_share_and_no_more(watched):
         looking.join(10)
     with pytest.raises(SehdrError, match="has ended"):
         live.render(None)
+
+
+def test_the_page_can_read_figures_that_a_step_lacks():
+    """A browser refuses NaN in JSON, and would take it for the end of the training."""
+    steps = Steps(1, 0, 0)
+    steps.psnr = math.nan
+    live = LiveTraining(steps, "masked")
+    assert len(list(live.attend())) == 1
+    assert json.loads(json.dumps(live.progress(), allow_nan=False))["psnr"] is None
 
 
 def test_an_interrupt_ends_a_pause_and_errors_reach_who_asked():

@@ -582,7 +582,7 @@ async function startTraining() {
       const t = await (await ask("training")).json();
       if (t.iteration === undefined) throw new Error("not yet");
       ended = t.ended;
-      $("progress").textContent = `${t.iteration} of ${t.total} \u00b7 loss ${t.loss.toFixed(4)} \u00b7 ${t.psnr.toFixed(1)} dB \u00b7 ${counts(t.gaussians)} Gaussians`
+      $("progress").textContent = `${t.iteration} of ${t.total} \u00b7 loss ${t.loss?.toFixed(4) ?? "none"} \u00b7 ${t.psnr?.toFixed(1) ?? "no"} dB \u00b7 ${counts(t.gaussians)} Gaussians`
         + (ended || t.left === null ? "" : ` \u00b7 ${t.left} left`) + ` \u00b7 ${(100 * t.share).toFixed(0)} % for pictures`;
       $("pause").textContent = t.paused ? "Resume" : "Pause";
       facts.gaussians = t.gaussians;
@@ -606,7 +606,7 @@ function curve(points) {
     context.strokeStyle = context.fillStyle = color;
     context.lineWidth = 1.5;
     context.beginPath();
-    points.forEach((p, i) => context.lineTo(i / Math.max(1, points.length - 1) * 247, 70 - 60 * (p[k + 1] - low) / (high - low || 1)));
+    points.forEach((p, i) => context.lineTo(i / Math.max(1, points.length - 1) * 247, 70 - 60 * ((p[k + 1] ?? NaN) - low) / (high - low || 1)));
     context.stroke();
     context.font = "10px system-ui";
     context.fillText(name, k * 84, 84);
