@@ -19,7 +19,7 @@ _OUTLIER, _ROUNDS, _MISALIGNED = 0.1, 4, 0.2
 # Codes up to which a photo can be at its black, stops between photos in which black does not change, codes that noise
 # changes it by, and the share of these codes that must not change for the photos to have a black of their own.
 _DARK, _BLACK_STOPS, _BLACK_NOISE, _BLACK_SHARE = 64, 2.0, 2, 0.2
-_LEAST_WEIGHT = 20.0  # Sum of a photo's weights below which nothing tells whether its time is right
+_LEAST_SHARE = 0.002  # Share of usable samples in a photo below which nothing tells whether its time is right
 # Least rise of log2 exposure from code to code, where the samples alone would let the curve fall.
 _LEAST_RISE = 1e-4
 _MOST_PIXELS, _SHOWN = 30_000, 3000
@@ -83,8 +83,9 @@ def calibrate_codes(
     if darker[np.diff(stops[order]) > 0.1].any():
         raise InputError(name, "a photo of longer exposure is darker than one of shorter", "correct the exposure times")
     selection = slice(None) if channel is None else [CHANNELS.index(channel)]
-    blacks = np.array([_black(codes[..., index], stops) for index in range(3)])
-    usable = codes > blacks
+    blacks = [_black(codes[..., index], stops) for index in range(3)]
+    whites = [255 - _black(255 - codes[..., index], -stops) for index in range(3)]  # The black of negatives
+    usable = (codes > np.array(blacks)) & (codes < np.array(whites))
     photo_codes = codes[..., selection].reshape(len(photos), -1)
     curve, residuals, weights, light = _solve(
         photo_codes, stops, usable[..., selection].reshape(photo_codes.shape), name
@@ -99,8 +100,8 @@ def calibrate_codes(
     )
     exposures = 2.0 ** (curve - curve[255])
     exposures[0] = 0.0
-    total = weights.sum(1)
-    offsets = np.where(total >= _LEAST_WEIGHT, (weights * residuals).sum(1) / np.maximum(total, 1e-9), np.nan)
+    offsets = (weights * residuals).sum(1) / np.maximum(weights.sum(1), 1e-9)
+    offsets[(weights > 0).mean(1) < _LEAST_SHARE] = np.nan
     return Calibration(
         TabulatedResponse(name, exposures, _CODES / 255),
         float(np.sqrt((weights * residuals**2).sum() / weights.sum())),
@@ -111,7 +112,7 @@ def calibrate_codes(
 
 
 def _black(codes: np.ndarray, stops: np.ndarray) -> int:
-    """Return the largest code [J, S] that more light does not change, as of scanned film; 0 if there is none."""
+    """Return the largest dark code of [J, S] that more light does not change, as of scanned film; 0 without one."""
     darkest = int(np.argmin(stops))
     brighter = np.flatnonzero(stops >= stops[darkest] + _BLACK_STOPS)
     if not len(brighter):

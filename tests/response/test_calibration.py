@@ -96,6 +96,23 @@ def test_black_above_code_0_is_no_light(tmp_path, logged):
     assert not any("than its time says" in line for line in logged)  # Nothing tells what the black photos show.
 
 
+def test_a_time_that_is_two_stops_off_is_found_though_its_photo_counts_little():
+    times = (1 / 16, 1 / 4, 1, 4, 16)
+    photos = photograph(response_by_name("srgb"), 8 * light(), times)
+    offsets = calibrate_codes(photos, (*times[:-1], 64)).photo_offsets
+    assert offsets[-1] == pytest.approx(-2, abs=0.1) and max(map(abs, offsets[:-1])) < 0.1
+
+
+@pytest.mark.parametrize("white", [245, 220])
+def test_white_below_code_255_is_a_bound(white):
+    """As of video, and of photos whose editor lowered the white."""
+    truth, times = response_by_name("srgb"), (1 / 16, 1 / 4, 1, 4, 16)
+    photos = [np.minimum(photo, white) for photo in photograph(truth, light(), times)]
+    codes = np.arange(20, white - 5) / 255
+    off = np.log2(calibrate_codes(photos, times).response.decode(codes)) - np.log2(truth.decode(codes))
+    assert np.ptp(off) < 0.15
+
+
 def test_channels_that_differ_are_said_and_the_curve_can_be_read(tmp_path, logged):
     times = (0.25, 1.0, 4.0)
     photos = photograph(response_by_name("srgb"), light(), times)
