@@ -79,8 +79,8 @@ def write_scene_page(
     if too_bright.any():
         text = "%s: its half floats end at %.0f times white; %d Gaussians are brighter, up to %.3g times, "
         text += "and are shown at that; .usdc, or .ply with --kind hdr, keeps their light"
-        brightest = HARMONIC_0 * float(harmonics[:, 0].max())
-        log.warning(text, path.name, HARMONIC_0 * _HALF, too_bright.sum(), brightest)
+        one = HARMONIC_0 / run.response.white
+        log.warning(text, path.name, one * _HALF, too_bright.sum(), one * float(np.abs(harmonics).max()))
         harmonics = np.clip(harmonics, -_HALF, _HALF)
     columns = dict(zip("xyz", gaussians.means.T))
     # As 3DGS has them: a color is 0.5 and the sum.

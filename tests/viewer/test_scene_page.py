@@ -21,6 +21,7 @@ from sehdr_warp.output.images.ldr_files import as_array
 from sehdr_warp.output.images.tonemap import display_gain, encode_srgb
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.world_transform import world_transform
+from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera
 from sehdr_warp.splats.arrays import HARMONIC_0
@@ -129,15 +130,17 @@ def test_a_page_of_map_coordinates_is_that_of_the_scene_near_the_origin(tmp_path
     np.testing.assert_allclose(far_facts["focus"], facts["focus"], atol=1e-5)
 
 
-def test_light_beyond_half_floats_is_named(tmp_path, caplog):
+@pytest.mark.parametrize("response, most, brightest", [("linear", 18515, "4.01e+05"), ("filmic", 1683, "3.64e+04")])
+def test_light_beyond_half_floats_is_named_in_whites_of_the_photos(tmp_path, caplog, response, most, brightest):
     lights = np.array([1.0, 1e5, 4e5])
     harmonics = np.tile((lights / HARMONIC_0)[:, None, None], (1, 1, 3)).astype(np.float32)
     gaussians = splats([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [0.9] * 3)
-    write_scene_page(
-        run_of(tmp_path, replace(gaussians, color_model="linear", harmonics=harmonics)), tmp_path / "a.html"
-    )
+    run = run_of(tmp_path, replace(gaussians, color_model="linear", harmonics=harmonics))
+    run.response = response_by_name(response)
+    write_scene_page(run, tmp_path / "a.html")
     assert (
-        "a.html: its half floats end at 18478 times white; 2 Gaussians are brighter, up to 4e+05 times" in caplog.text
+        f"a.html: its half floats end at {most} times white; 2 Gaussians are brighter, up to {brightest} times"
+        in caplog.text
     )
 
 
