@@ -135,7 +135,7 @@ def world_transform(
         rotation = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) else np.eye(3)
         return WorldTransform(rotation, np.zeros(3), factor)
     if direction is None:
-        direction = up_direction(cameras)
+        direction = up_direction(cameras) if run.up is None else run.up.direction
         roll = typical_roll(cameras, direction)
         if roll > _WORST_ROLL:
             text = "the photos share no up direction (typically %.0f degrees off); set --up x,y,z, or --axes scene"
@@ -167,7 +167,7 @@ def scene_up(run: "RenderableScene", up: str | Sequence[float] | None = None) ->
     run = run.reference or run
     direction = _known_up(run, up, read_orientation(run))
     if direction is None and run.world_matrix is None and (cameras := training_cameras(run)):
-        direction = up_direction(cameras)
+        direction = up_direction(cameras) if run.up is None else run.up.direction
     return world_transform(run).rotation[1] if direction is None else direction
 
 

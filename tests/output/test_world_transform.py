@@ -14,10 +14,10 @@ from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.lighting.environment_map import write_environment_map
 from sehdr_warp.output.render_views import render_views
-from sehdr_warp.output.world_transform import WorldTransform, from_photos, world_transform, write_orientation
+from sehdr_warp.output.world_transform import WorldTransform, from_photos, scene_up, world_transform, write_orientation
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera, load_cameras, load_scene, look_at
-from sehdr_warp.scene.gravity import is_pitch_known, up_direction
+from sehdr_warp.scene.gravity import UpDirection, is_pitch_known, up_direction
 from sehdr_warp.splats import read_gaussians, write_gaussians
 
 from ..make_scenes import write_colmap
@@ -108,6 +108,17 @@ def test_photos_without_a_common_up_are_named(logged):
     run.cameras = [Entry(str(i), "train", each) for i, each in enumerate(cameras)]
     world_transform(run)
     assert any("share no up direction" in line and "--up x,y,z" in line for line in logged)
+
+
+def test_photos_that_are_stored_on_their_side_keep_the_up_of_their_training(logged):
+    """Poses alone show no up then; the training read how the camera was held."""
+    places = ring(12, 4, 1)
+    run = AnalyticRun()
+    cameras = photos(np.array([0, 1, 0]), places, np.zeros(3), turned=1)
+    run.cameras = [Entry(str(i), "train", each) for i, each in enumerate(cameras)]
+    run.up = UpDirection(np.array([0, 1.0, 0]), "cameras")
+    assert world_transform(run).rotation[1] == pytest.approx([0, 1, 0])
+    assert scene_up(run) == pytest.approx([0, 1, 0]) and not logged
 
 
 def test_a_transform_keeps_what_cameras_see_and_can_be_undone():
