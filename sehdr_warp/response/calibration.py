@@ -19,7 +19,8 @@ _OUTLIER, _ROUNDS, _MISALIGNED = 0.1, 4, 0.2
 # Codes up to which a photo can be at its black, stops between photos in which black does not change, codes that noise
 # changes it by, and the share of these codes that must not change for the photos to have a black of their own.
 _DARK, _BLACK_STOPS, _BLACK_NOISE, _BLACK_SHARE = 64, 2.0, 2, 0.2
-_LEAST_SHARE = 0.002  # Share of usable samples in a photo below which nothing tells whether its time is right
+# Shares of usable samples in a photo below which nothing tells whether its time and its scene are right.
+_LEAST_SHARE, _LEAST_SHARE_OF_SCENE = 0.002, 0.1
 # Least rise of log2 exposure from code to code, where the samples alone would let the curve fall.
 _LEAST_RISE = 1e-4
 _MOST_PIXELS, _SHOWN = 30_000, 3000
@@ -38,6 +39,8 @@ class Calibration:
             determine a curve alone.
         photo_offsets: stops by which each photo is brighter than its time states; NaN if nearly all of it is black or
             white.
+        photo_spreads: median difference of a photo's samples from that offset, stops; NaN if most of it is black or
+            white.
         samples: [S, 2] exposures and encoded values of some samples, for a plot.
     """
 
@@ -45,6 +48,7 @@ class Calibration:
     residual: float
     channel_spread: tuple[float, ...]
     photo_offsets: tuple[float, ...]
+    photo_spreads: tuple[float, ...]
     samples: np.ndarray
 
 
@@ -101,12 +105,18 @@ def calibrate_codes(
     exposures = 2.0 ** (curve - curve[255])
     exposures[0] = 0.0
     offsets = (weights * residuals).sum(1) / np.maximum(weights.sum(1), 1e-9)
-    offsets[(weights > 0).mean(1) < _LEAST_SHARE] = np.nan
+    shares = (weights > 0).mean(1)
+    offsets[shares < _LEAST_SHARE] = np.nan
+    spreads = [
+        float(np.median(np.abs(row[used] - np.median(row[used])))) if share >= _LEAST_SHARE_OF_SCENE else float("nan")
+        for row, used, share in zip(residuals, weights > 0, shares, strict=True)
+    ]
     return Calibration(
         TabulatedResponse(name, exposures, _CODES / 255),
         float(np.sqrt((weights * residuals**2).sum() / weights.sum())),
         tuple(_spread(codes[..., index], stops, usable[..., index], curve) for index in range(3)),
         tuple(offsets),
+        tuple(spreads),
         samples,
     )
 

@@ -103,6 +103,15 @@ def test_a_time_that_is_two_stops_off_is_found_though_its_photo_counts_little():
     assert offsets[-1] == pytest.approx(-2, abs=0.1) and max(map(abs, offsets[:-1])) < 0.1
 
 
+def test_a_photo_of_something_else_is_named(tmp_path, logged):
+    times = (1 / 16, 1 / 4, 1, 4, 16)
+    photos = photograph(response_by_name("srgb"), light(), times)
+    photos[3] = photos[3][::-1, ::-1]
+    sw.calibrate(write_stack(tmp_path / "stack", photos, times))
+    (line,) = (line for line in logged if "leave it out" in line)
+    assert line.startswith("half of 3.png differs by ")
+
+
 @pytest.mark.parametrize("white", [245, 220])
 def test_white_below_code_255_is_a_bound(white):
     """As of video, and of photos whose editor lowered the white."""

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-# RMS stops from which a channel's curve clearly differs from the shared one, and by which a photo may miss its time.
-CHANNELS_DIFFER, WRONG_TIME = 0.15, 0.25
+# Stops from which a channel's curve clearly differs from the shared one (RMS), by which a photo may miss its time, and
+# by which half of a photo may differ from the others (of stacks by six cameras at most 0.5, 0.4 to 3 if one is turned).
+CHANNELS_DIFFER, WRONG_TIME, OTHER_SCENE = 0.15, 0.25, 0.55
 CSV_ROWS = 1024  # Of a file with a column for each channel
 # What makes photos a stack: the least factor between times, and the least rank correlation in thumbnails of this side
 # over the pixels that neither clips. Real stacks correlate by 0.98 and more, photos from different places by 0.9.
@@ -187,8 +188,11 @@ def _tell(calibration: "Calibration", files: list[Path], channel: str | None) ->
         log.warning(
             "the channels' curves differ from the shared one, stops: %s; --channel each keeps them", spread_text
         )
-    for file, off in zip(files, calibration.photo_offsets, strict=True):
-        if abs(off) > WRONG_TIME:
+    for file, off, spread in zip(files, calibration.photo_offsets, calibration.photo_spreads, strict=True):
+        if spread > OTHER_SCENE:
+            text = "half of %s differs by %.2f stops or more from what the other photos show: leave it out"
+            log.warning(text, file.name, spread)
+        elif abs(off) > WRONG_TIME:
             side = "brighter" if off > 0 else "darker"
             log.warning("%s is %.2f stops %s than its time says", file.name, abs(off), side)
 
