@@ -91,11 +91,10 @@ def find_photos(folder: Path) -> DataparserOutputs:
     for place in ("sparse/0", "sparse"):
         if not model and any((folder / place / f"images{end}").is_file() for end in (".bin", ".txt")):
             notes.append(f"{place} is not read, because it has no cameras.bin or cameras.txt: cameras are found anew")
-    if photos[0].parent != folder and len(candidates[0]) > 1:
-        count = f"{len(candidates[0])} photos beside {photos[0].parent.name}"
-        notes.append(
-            f"{count} are not read, because there are more in it: {first_names([p.name for p in candidates[0]])}"
-        )
+    for others in candidates if photos[0].parent != folder else []:
+        if len(others) > 1 and others[0].parent != photos[0].parent:
+            count, names = f"{len(others)} photos of {others[0].parent.name}", first_names([p.name for p in others])
+            notes.append(f"{count} are not read, because there are more in {photos[0].parent.name}: {names}")
     if photos[0].parent == folder and (inner := _folders_with_photos(folder)):
         notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
     stems = Counter(fold_name(photo.stem) for photo in photos) if together else {}

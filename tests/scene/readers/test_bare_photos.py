@@ -126,8 +126,10 @@ def test_fewer_pictures_of_results_lie_beside_the_photos(tmp_path):
         Image.fromarray(pattern(16, 12, 10 + i)).save(tmp_path / f"mesh{i}.jpg")
     dataset = find_photos(tmp_path)
     assert [record.image.parent.name for record in dataset.records] == ["images"] * 5
-    beside = "3 photos beside images are not read, because there are more in it: mesh0.jpg, mesh1.jpg, mesh2.jpg"
-    assert beside in dataset.notes
+    others = "are not read, because there are more in"
+    assert f"3 photos of {tmp_path.name} {others} images: mesh0.jpg, mesh1.jpg, mesh2.jpg" in dataset.notes
+    photos(tmp_path / "input", 6)
+    assert any(note.startswith(f"5 photos of images {others} input: ") for note in find_photos(tmp_path).notes)
 
 
 @pytest.mark.parametrize("file, tool", [
