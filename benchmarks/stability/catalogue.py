@@ -1,14 +1,13 @@
-"""All cases by group: those of `sehdr-warp check`, and further ones of splats, light and training."""
+"""All cases by group: those of `sehdr-warp check`, and those of light and training."""
 
 from sehdr_warp.check.case import Case
-from sehdr_warp.check.splat_cases import CASES as CHECKED_CASES
+from sehdr_warp.check.splat_cases import POISON_CASES, SPLAT_CASES
 from sehdr_warp.errors import SehdrError
 
 from .light_cases import LIGHT_CASES
-from .splat_cases import SPLAT_CASES
 from .training_cases import TRAINING_CASES
 
-CASES: tuple[Case, ...] = (*CHECKED_CASES, *SPLAT_CASES, *LIGHT_CASES, *TRAINING_CASES)
+CASES: tuple[Case, ...] = (*SPLAT_CASES, *LIGHT_CASES, *POISON_CASES, *TRAINING_CASES)
 
 
 def choose_cases(names: str | None, quick: bool = False) -> list[Case]:
