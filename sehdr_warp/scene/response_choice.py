@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, SehdrError
 from ..subsets import counted, every_nth
 from .dataparser import DataparserOutputs
 from .images.exif import are_camera_jpegs
@@ -169,7 +169,14 @@ def _select_for_dataset(dataset: DataparserOutputs, method: str, candidates: Seq
             del image  # Free the memory before the next photo is read.
 
     files = [None if record.derived else record.image for record in records]
-    return select_for_codes(codes(), files, method, candidates)
+    try:
+        return select_for_codes(codes(), files, method, candidates)
+    except InputError:
+        raise
+    except SehdrError as error:  # By "paper" alone
+        problem = "the photo that the response is chosen from is black or white"
+        remedy = "name a response, or expose the photos so that the scene shows"
+        raise InputError(dataset.folder, problem, remedy) from error
 
 
 def _sample(photos: Sequence, method: str) -> Sequence:

@@ -50,3 +50,6 @@ def test_photos_that_show_nothing_are_refused(tmp_path, value):
         Image.new("RGB", (64, 48), (value,) * 3).save(path)
     with pytest.raises(InputError, match=rf"black or white in 100\.0 % \(mean {value / 255:.3f}\)"):
         load_scene(tmp_path)
+    with pytest.raises(InputError, match="the photo that the response is chosen from is black or white") as refused:
+        load_scene(tmp_path, method="paper")
+    assert str(refused.value).startswith(str(tmp_path))
