@@ -124,9 +124,15 @@ def config_as_toml(config: Config, differing: bool = False) -> str:
             meaning = " ".join((item.description or "").split())
             lines += textwrap.wrap(meaning, 116, initial_indent="# ", subsequent_indent="# ")
         changed = "" if differing or value == item.default else f"  # default: {json.dumps(item.default)}"
-        # JSON's strings, numbers, booleans and lists are TOML's as well, but for escapes of letters beyond 16 bits.
-        lines.append(f"{name} = {json.dumps(value, ensure_ascii=False)}{changed}")
+        lines.append(f"{name} = {_as_toml(value)}{changed}")
     return "\n".join(lines)
+
+
+def _as_toml(value: Any) -> str:
+    """Return a value as ASCII: JSON's strings, numbers, booleans and lists are TOML's, but for escapes over 16 bits."""
+    text = json.dumps(value, ensure_ascii=False)
+    escaped = (f"\\u{ord(letter):04x}" if ord(letter) < 0x10000 else f"\\U{ord(letter):08x}" for letter in text)
+    return "".join(letter if 31 < ord(letter) < 127 else code for letter, code in zip(text, escaped, strict=True))
 
 
 def value_of(path: str, text: str):
