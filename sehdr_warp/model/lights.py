@@ -128,30 +128,30 @@ def find_lights(
         if group.weights @ group.too_bright < CLIPPED * group.weights.sum():
             continue  # Darker photos alone show most of it and do not clip it, as the part of a walk in the sun.
         shape = fitted_shape(group.positions, group.widths, group.weights, middle)
-        shown = _photos_of_whole_light(photos.cameras, group, shape)
-        if not len(shown.photos):
+        light_photos = _photos_of_whole_light(photos.cameras, group, shape)
+        if not len(light_photos.photos):
             # Every photo cuts the light off at its border. The one that shows most of it looks beyond that.
             best = int(np.argmax(group.angles.sum(1) * (solid_angles(shape, photos.cameras) > 0)))
             if best not in panoramas:
                 panoramas[best] = _received_by(field, _panorama(photos.cameras[best].position, photos.focal), degree)
             around = panoramas[best]
-            shown = _Shown(
+            light_photos = _LightPhotos(
                 np.array([best]),
                 around.angles[group.index].sum(0, keepdim=True).cpu().numpy(),
                 around.light[group.index].sum(0, keepdim=True).cpu().numpy(),
             )
-        shown = shown.without_obstructed(solid_angles(shape, photos.cameras))
-        if not len(shown.photos):
+        light_photos = light_photos.without_obstructed(solid_angles(shape, photos.cameras))
+        if not len(light_photos.photos):
             continue  # A flat light at whose edge all cameras stand.
-        places = [photos.cameras[index].position for index in shown.photos]
-        area = float(fit_solid_angles(shape, shown.angles[:, None], places)[0])
+        places = [photos.cameras[index].position for index in light_photos.photos]
+        area = float(fit_solid_angles(shape, light_photos.angles[:, None], places)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
         sides = [side * min(max(area, 1e-4), 1e4) ** 0.5 for side in shape.size]
         shape = replace(shape, size=(sides[0], sides[1]))
-        radiance = fit_solid_angles(shape, shown.light, places)
+        radiance = fit_solid_angles(shape, light_photos.light, places)
         if radiance.mean() * shape.solid_angle(middle) < LEAST_SHARE * total:
             continue
-        deviation = _deviation(group, float(photos.measurable[shown.photos].max()))
+        deviation = _deviation(group, float(photos.measurable[light_photos.photos].max()))
         share = float(reaches_middle[group.index].sum()) / total
         bound = np.minimum(photos.white, radiance)
         lights.append(Light(shape, radiance, bound, deviation, share, group.index))
@@ -230,19 +230,19 @@ class _Candidates:
         )
 
 
-class _Shown(NamedTuple):
+class _LightPhotos(NamedTuple):
     """Light that P photos receive of one light: their indices [P], solid angles [P] and light [P, 3]."""
 
     photos: np.ndarray
     angles: np.ndarray
     light: np.ndarray
 
-    def without_obstructed(self, whole: np.ndarray) -> "_Shown":
+    def without_obstructed(self, whole: np.ndarray) -> "_LightPhotos":
         """Return the photos that show about as much of the light's solid angles [V], `whole`, as most do."""
         expected = whole[self.photos]
         fractions = self.angles / np.maximum(expected, 1e-30)
         clear = (expected > 0) & (fractions >= UNOBSTRUCTED * np.quantile(fractions, 0.9))
-        return _Shown(self.photos[clear], self.angles[clear], self.light[clear])
+        return _LightPhotos(self.photos[clear], self.angles[clear], self.light[clear])
 
 
 def _measure_photos(field: RadianceField, views: Sequence[tuple[Camera, float]], degree: int | None) -> _Photos:
@@ -298,11 +298,11 @@ def _candidates(field: RadianceField, clipped: Tensor, photos: _Photos) -> _Cand
     )
 
 
-def _photos_of_whole_light(cameras: Sequence[Camera], group: _Candidates, shape: LightShape) -> _Shown:
+def _photos_of_whole_light(cameras: Sequence[Camera], group: _Candidates, shape: LightShape) -> _LightPhotos:
     """Return the photos that do not cut the light off at their border and see its face."""
     whole = [_in_frame(camera, group.positions, group.widths, group.weights) for camera in cameras]
     photos = np.flatnonzero(whole & (solid_angles(shape, cameras) > 0))
-    return _Shown(photos, group.angles.sum(1)[photos], group.light.sum(1)[photos])
+    return _LightPhotos(photos, group.angles.sum(1)[photos], group.light.sum(1)[photos])
 
 
 def _deviation(group: _Candidates, measurable: float) -> float | None:

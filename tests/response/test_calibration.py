@@ -114,7 +114,7 @@ def test_a_photo_of_something_else_is_named(tmp_path, logged):
 
 @pytest.mark.parametrize("white", [245, 220])
 def test_white_below_code_255_is_a_bound(white):
-    """As of video, and of photos whose editor lowered the white."""
+    """Stacks of video frames, or of photos whose editor lowered the white, still give the curve."""
     truth, times = response_by_name("srgb"), (1 / 16, 1 / 4, 1, 4, 16)
     photos = [np.minimum(photo, white) for photo in photograph(truth, light(), times)]
     codes = np.arange(20, white - 5) / 255

@@ -268,7 +268,7 @@ def test_what_is_not_finite_is_left_out_and_odd_harmonics_are_refused(tmp_path, 
 
 @pytest.mark.parametrize("matrix", [np.diag([0, 0, 0, 1]), np.diag([1, 1, 1.0003, 1]), np.diag([1, 1, -1, 1])])
 def test_a_transform_that_cannot_be_undone_is_refused_as_the_file_is_read(tmp_path, matrix):
-    """Where such a file was placed in the photos' coordinates, a plain ValueError ended the program."""
+    """Files with a matrix that is no similarity are refused when they are read, not when they are placed."""
     write_gaussians(tmp_path / "a.ply", replace(gaussians(5), world_matrix=matrix.astype(float)))
     with pytest.raises(InputError, match=r"a\.ply: its world_matrix (does not keep|is not)"):
         read_gaussians(tmp_path / "a.ply")

@@ -45,7 +45,7 @@ def run(tmp_path, monkeypatch):
 
 
 def received(place):
-    """What reaches a place of the Gaussians: the first of each light gives all of its light."""
+    """Return what reaches a place: the first Gaussian of each light gives all of its light."""
     angles, light = torch.zeros(6, dtype=torch.float64), torch.zeros(6, 3, dtype=torch.float64)
     for each in LIGHTS:
         angles[each.members[0]] = each.shape.solid_angle(place)
