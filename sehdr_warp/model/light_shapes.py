@@ -1,13 +1,13 @@
 """Shapes of lights: the rectangle or sphere of a group of Gaussians, and the solid angles that points see of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..scene import Camera
 
-FLATNESS = 0.15  # Of the smallest to the middle variance, below which a light is a flat rectangle
+FLATNESS = 0.15  # Ratio of variances below which a light is flat, or thin; the half of a ball that photos show has 0.22
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +25,14 @@ class LightShape:
     position: np.ndarray
     axes: np.ndarray
     size: tuple[float, float]
+
+    def with_area(self, factor: float) -> "LightShape":
+        """Return the shape with a multiple of its area; of a thin rectangle the width stays, up to a square."""
+        width, height = self.size
+        if height**2 < FLATNESS * width**2:
+            width = max(width, float(np.sqrt(factor * width * height)))
+            return replace(self, size=(width, factor * self.size[0] * height / width))
+        return replace(self, size=(width * factor**0.5, height * factor**0.5))
 
     def solid_angle(self, point: np.ndarray) -> float:
         """Return the solid angle that a point sees of a light; 0 from behind a rectangle, 2 pi within a sphere."""
@@ -56,8 +64,12 @@ def connected_groups(positions: np.ndarray, reach: float) -> list[np.ndarray]:
     return [np.flatnonzero(labels == label) for label in range(count)]
 
 
-def fitted_shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, middle: np.ndarray) -> LightShape:
-    """Return the rectangle or sphere with the weighted mean and variances of Gaussians."""
+def fitted_shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, viewer: np.ndarray) -> LightShape:
+    """Return the rectangle or sphere with the weighted mean and variances of Gaussians.
+
+    A rectangle emits to the side of `viewer` [3]. A thin one, such as a tube or a strip, whose Gaussians are as wide as
+    it is, faces that point.
+    """
     weights = weights / weights.sum()
     position = weights @ positions
     offsets = positions - position
@@ -66,11 +78,16 @@ def fitted_shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray,
     # A Gaussian reaches beyond its center on the light's face, but not across a flat one.
     spread = float(weights @ widths**2)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1].T
-    flat = values[2] < FLATNESS * values[1]
-    if not flat:
+    if values[2] < FLATNESS * np.sqrt(values[0] * values[1]) and values[1] > spread:
+        normal = vectors[2] if vectors[2] @ (viewer - position) >= 0 else -vectors[2]
+    elif values[1] < FLATNESS * values[0] and values[0] > spread:
+        normal = viewer - position
+        normal = normal - (normal @ vectors[0]) * vectors[0]
+        length = float(np.linalg.norm(normal))
+        normal = normal / length if length > 0 else vectors[2]
+    else:
         diameter = 2 * float(np.sqrt(values.sum() + spread))
         return LightShape("sphere", position, np.eye(3), (diameter, diameter))
-    normal = vectors[2] if vectors[2] @ (middle - position) >= 0 else -vectors[2]
     axes = np.stack([vectors[0], np.cross(normal, vectors[0]), normal])
     width, height = (float(np.sqrt(12 * (value + spread))) for value in values[:2])
     return LightShape("rect", position, axes, (width, height))

@@ -1,7 +1,7 @@
 """Lights of a trained scene: groups of bright Gaussians that the photos clipped, as simple emitting shapes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from typing import NamedTuple
 
@@ -146,8 +146,7 @@ def find_lights(
         places = [photos.cameras[index].position for index in light_photos.photos]
         area = float(fit_solid_angles(shape, light_photos.angles[:, None], places)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
-        sides = [side * min(max(area, 1e-4), 1e4) ** 0.5 for side in shape.size]
-        shape = replace(shape, size=(sides[0], sides[1]))
+        shape = shape.with_area(min(max(area, 1e-4), 1e4))
         radiance = fit_solid_angles(shape, light_photos.light, places)
         if radiance.mean() * shape.solid_angle(middle) < LEAST_SHARE * total:
             continue

@@ -6,6 +6,7 @@ import torch
 
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.confidence import gather_evidence
+from sehdr_warp.model.light_shapes import fitted_shape
 from sehdr_warp.model.lights import find_lights
 from sehdr_warp.output.lighting.environment_map import latlong
 from sehdr_warp.scene import Camera, View, codes_of, look_at
@@ -68,6 +69,41 @@ def test_a_ball_is_a_sphere():
     assert light.shape.kind == "sphere" and light.shape.position == pytest.approx([0.5, 0, 3.9], abs=0.15)
     irradiance = light.radiance * light.shape.solid_angle(np.zeros(3))
     assert irradiance == pytest.approx(received(scene), rel=0.1)
+
+
+@pytest.mark.parametrize("radius, width", [(0.02, 0.015), (0.02, 0.03), (0.05, 0.02)])
+def test_a_tube_keeps_its_length_and_faces_the_photos(radius, width):
+    """A slanting tube, half of which cameras see."""
+    angle, along = np.random.default_rng(0).uniform([0, -0.5], [np.pi, 0.5], (400, 2)).T
+    axis, across = np.array([0.8, 0.6, 0]), np.array([-0.6, 0.8, 0])
+    places = np.outer(along, axis) + radius * np.outer(np.cos(angle), across)
+    places[:, 2] = 4 - radius * np.sin(angle)
+    scene = field(places, RADIANCE, width)
+    (light,) = find_lights(scene, torch.ones(400), views())
+    assert light.shape.kind == "rect" and light.shape.size[0] == pytest.approx(1.0, abs=0.1)
+    assert light.shape.size[1] < 0.2 and abs(light.shape.axes[0] @ axis) == pytest.approx(1, abs=0.01)
+    assert light.shape.axes[2] == pytest.approx([0, 0, -1], abs=0.1)
+    assert light.radiance == pytest.approx(RADIANCE, rel=0.05)
+    assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.06)
+
+
+def test_a_window_of_uncertain_depth_is_a_rectangle_and_half_a_ball_a_sphere():
+    places = panel(1.2, 0.6)
+    places[:, 2] += np.random.default_rng(0).normal(0, 0.08, len(places))
+    window = fitted_shape(places, np.full(len(places), 0.05), np.ones(len(places)), np.zeros(3))
+    assert window.kind == "rect" and window.size == pytest.approx((1.2, 0.6), rel=0.1)
+    assert window.axes[2] == pytest.approx([0, 0, -1], abs=0.1)
+    half = ball((0, 0, 4))
+    half = half[half[:, 2] < 4]
+    assert fitted_shape(half, np.full(len(half), 0.03), 4 - half[:, 2], np.zeros(3)).kind == "sphere"
+
+
+@pytest.mark.parametrize("offset", [(0.15, 0, 0), (0, 0.15, 0), (0, 0, 0.15)])
+def test_few_gaussians_are_a_light_whatever_plane_they_span(offset):
+    places = np.array([[0, 0, 4], np.add(offset, (0, 0, 4)), [-0.01, -0.02, 4.01]])
+    scene = field(places, RADIANCE, 0.1)
+    (light,) = find_lights(scene, torch.ones(3), views())
+    assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.1)
 
 
 def test_lights_apart_are_two_and_what_is_dark_or_did_not_clip_is_none():
