@@ -63,13 +63,20 @@ def load_config(
 
 
 def as_config(config: object) -> Config | None:
-    """Convert any of the forms that create_trainer() takes to a Config; None stays None."""
+    """Convert any of the forms that create_trainer() takes to a Config; None stays None.
+
+    The plan does not change fields of a mapping: they are added to plan.keep.
+    """
     if config is None or isinstance(config, Config):
         return config
     if isinstance(config, str | Path):
         return load_config(config)
     if isinstance(config, Mapping):
-        return override_config(Config(), dict(config), "overrides")
+        changed = override_config(Config(), dict(config), "overrides")
+        tables = {f"{table}.{name}" for table, names in config.items() if isinstance(names, Mapping) for name in names}
+        stated = tables | {path for path, value in config.items() if not isinstance(value, Mapping)}
+        user_fields = {*changed.plan.keep, *(path for path in stated if not path.startswith("plan."))}
+        return override_config(changed, {"plan.keep": sorted(user_fields)})
     raise InputError("config", f"is {type(config).__name__}", "pass a preset's name, a dict of fields or a Config")
 
 

@@ -77,8 +77,8 @@ def create_trainer(
     Args:
         scene: A scene from load_scene(); its test views are the held-out ones.
         out: Run folder.
-        config: A Config, name or file of a preset, or fields that differ from the default preset; by default that
-            preset or, if resuming, the config of the run.
+        config: A Config, name or file of a preset, or fields that differ from the default preset, which the plan does
+            not change; by default that preset or, if resuming, the config of the run.
         device: "cpu", "cuda:0", ...; by default the first GPU, or the CPU if there is none.
         resume: Continue the run in `out` from its newest complete checkpoint; on the CPU the result is that of an
             uninterrupted training, bit for bit. More `schedule.iterations`, in a Config or in fields, stretch its

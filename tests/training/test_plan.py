@@ -269,6 +269,8 @@ def test_what_the_user_gave_stays(scene):
     assert plan.user_fields == {"schedule.iterations": 9000}
     assert "schedule.iterations" not in fields(plan)
     assert "set by you: schedule.iterations = 9000" in plan.table()
+    for mapping in ({"schedule.iterations": 9000, "seed": 1}, {"schedule": {"iterations": 9000}}):
+        assert make_plan(scene, mapping).config.schedule.iterations == 9000
 
 
 def outwards(index):
