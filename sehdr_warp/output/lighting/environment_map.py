@@ -37,6 +37,7 @@ _WHOLE = 99.5  # Covered per cent from which nothing is said of the rest
 _FINEST = {"latlong": 4096, "cube": 1024}  # Smaller maps are averaged from renders of at most so many pixels across
 _MOST_PIXELS = 1 << 21  # Pixels that are rendered at once
 _COARSE, _DARKEST = 128, 1e-9  # Inpainting: columns of the coarse map, and the least light
+_SURROUNDINGS, _MOST_OVER = 0.1, 8.0  # Inpainting: radians, and the most times the mean around that counts
 # The nearest axes of a cube's faces in OpenEXR's order (+X -X +Y -Y +Z -Z): to the right, down, and out.
 _FACES = np.array(
     [
@@ -318,8 +319,8 @@ def solid_angles(size: int, layout: str) -> np.ndarray:
 def inpainted_light(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return [H, W, 3] of light for each direction, interpolated from the directions that photos cover.
 
-    It is the geometric mean of their light weighted by the inverse fourth power of the distance on the sphere, so that
-    lamps do not flood their surroundings.
+    It is the geometric mean of their light weighted by the inverse fourth power of the distance on the sphere. What is
+    brighter than its surroundings, such as a lamp, counts as at most _MOST_OVER times these, so that it floods nothing.
     """
     from scipy.ndimage import map_coordinates
 
@@ -331,9 +332,16 @@ def inpainted_light(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, 
     logs = np.log(np.maximum(hdr[covered] / alpha[covered][:, None], _DARKEST))
     values = np.concatenate([logs, np.ones((len(logs), 1))], axis=1) * weight[covered][:, None]
     sums = np.stack([np.bincount(cells[covered], column, rows * columns) for column in values.T], axis=1)
-    has_light, places = sums[:, 3] > 0, latlong(columns).reshape(-1, 3)
-    near = sums[has_light, 3] / (2 - 2 * places @ places[has_light].T + (2 * np.pi / columns) ** 2) ** 2
-    light = np.exp(near @ (sums[has_light, :3] / sums[has_light, 3:]) / near.sum(axis=1, keepdims=True))
+    has_light, places = sums[:, 3] > 0, latlong(columns).reshape(-1, 3).astype(np.float32)
+    angles = sums[has_light, 3].astype(np.float32)
+
+    def mean_around(at: np.ndarray, logs: np.ndarray, width: float, power: int) -> np.ndarray:
+        near = angles / (2 - 2 * at @ places[has_light].T + width**2) ** power
+        return near @ logs / near.sum(axis=1, keepdims=True)
+
+    logs = sums[has_light, :3] / sums[has_light, 3:]
+    most = mean_around(places[has_light], logs, _SURROUNDINGS, 1) + np.log(_MOST_OVER)
+    light = np.exp(mean_around(places, np.minimum(logs, most), 2 * np.pi / columns, 2))
     wrapped = np.pad(light.reshape(rows, columns, 3), ((0, 0), (1, 1), (0, 0)), mode="wrap")
     at = np.stack([down - 0.5, across + 0.5])
     return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)

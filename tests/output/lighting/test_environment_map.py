@@ -13,6 +13,8 @@ from sehdr_warp.output.images.exr import write_radiance
 from sehdr_warp.output.lighting import environment_map
 from sehdr_warp.output.lighting.environment_map import (
     cube,
+    inpainted_light,
+    latlong,
     render_map,
     solid_angles,
     write_environment_map,
@@ -187,6 +189,19 @@ def test_unseen_directions_are_inpainted_on_request(tmp_path, run, logged):
     share = (radiances * solid_angles(64, "latlong")).sum() / solid_angles(64, "latlong").sum()
     assert f"env.exr: {100 * share:.0f} % of all directions seen; the rest is black, --inpaint" in "\n".join(logged)
     assert f"fill.exr: {100 * share:.0f} % of all directions seen" in logged
+
+
+def test_a_lamp_beyond_what_photos_show_floods_nothing_but_a_window_lights_what_is_beside_it():
+    """Photos show a wall of 1 below, and a light of 1000 alone in the upper half or at its border."""
+    directions, weight = latlong(256), solid_angles(256, "latlong")
+    x, y, z = np.moveaxis(directions, 2, 0)
+    lamp = (x**2 + (y - 0.1) ** 2 < 0.05**2) & (z > 0)
+    window = (np.abs(np.arctan2(x, z)) < 0.6) & (np.abs(y) < 0.3)
+    for lit, least, most in ((lamp, 1, 40), (window, 100, 1000)):
+        alpha = (lit | (y < 0)).astype(float)
+        light = np.where(lit, 1000.0, 1.0)[..., None] * np.ones(3)
+        filled = inpainted_light(light, alpha, directions, weight)[alpha == 0]
+        assert least < filled.max() < most and filled.min() > 0.9
 
 
 def test_points_and_options_that_cannot_be(tmp_path, run, logged):
