@@ -31,7 +31,7 @@ class Comparison:
         hdr: Rendered radiance.
         exposure_time: Seconds of the photo.
         gain: Of its response, see display_gain.
-        truth: HDR truth, if the scene has it.
+        truth: HDR truth in the scale of `hdr`, if the scene has it.
         confidence: [H, W] in [0, 1] of the render, if it was measured.
         new: Rendered half-way to the nearest other view, if there is one.
         alpha, new_alpha: [H, W] coverage of `hdr` and `new`.
@@ -91,8 +91,15 @@ def opening_of(comparison: Comparison) -> Opening:
     return Opening(stops, "Light above white", lead)
 
 
-def compare(run: "RenderableScene", view: View, views: Sequence[View]) -> Comparison:
-    """Render a view of a run and compare it with its photo; `views` are all views of the scene."""
+def compare(run: "RenderableScene", view: View, views: Sequence[View], scale: float = 1.0) -> Comparison:
+    """Render a view of a run and compare it with its photo.
+
+    Args:
+        run: The run.
+        view: With photo and truth.
+        views: All views of the scene.
+        scale: Factor from the run's radiance to that of the truth.
+    """
     confidence, render, new = run.render_confidence(view.camera), run.render(view.camera), None
     others = [other.camera for other in views if other.name != view.name]
     if others:
@@ -105,7 +112,7 @@ def compare(run: "RenderableScene", view: View, views: Sequence[View]) -> Compar
         hdr=as_array(render.hdr),
         exposure_time=view.exposure_time,
         gain=display_gain(run.response),
-        truth=view.hdr,
+        truth=None if view.hdr is None else view.hdr / scale,
         confidence=None if confidence is None else as_array(confidence),
         new=None if new is None else as_array(new.hdr),
         alpha=as_array(render.alpha),

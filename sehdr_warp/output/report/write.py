@@ -65,7 +65,7 @@ def write_report(
         out: Folder for the files.
         view_count: Number of views, evenly chosen.
         overwrite: Replace files that exist.
-        evaluation: Result of evaluate(), for the page's figures.
+        evaluation: Result of evaluate(), for the page's figures, and for the scale of the truth.
 
     Raises:
         InputError: If a file exists, or the folder holds photos.
@@ -85,7 +85,9 @@ def write_report(
     if not candidates:
         raise SehdrError("the scene has no views to report on; check its splits")
     views = evenly(candidates, max(view_count, 1))
-    comparisons = [compare(run, view, scene.views) for _, view in track_progress("comparing views", views, log)]
+    aligned = (evaluation or {}).get("protocol", {}).get("aligned") or {}
+    scale = aligned.get("scale") or 1.0  # Photos tell radiance up to a factor if their times or curve are not known.
+    comparisons = [compare(run, view, scene.views, scale) for _, view in track_progress("comparing views", views, log)]
     brightest = max(comparisons, key=lambda comparison: comparison.light_above_white)
     compared = comparison_figure(comparisons, _caption(views, metrics, held_out), held_out=held_out)
     figures = [compared, stops_figure(brightest)] + [training_chart({scene.name: [metrics]})] * charted

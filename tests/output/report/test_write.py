@@ -7,6 +7,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.images.tonemap import display_gain, encode_srgb, expose
+from sehdr_warp.output.report import write
 from sehdr_warp.output.report.charts import training_chart
 from sehdr_warp.output.report.comparison import Comparison, compare, darker_stops
 from sehdr_warp.output.report.write import check_report_folder, comparison_figure, stops_figure, write_report
@@ -88,6 +89,17 @@ def test_stops_show_what_the_photo_lost(tmp_path):
     np.testing.assert_array_equal(hdr, truth)
     trusted = stops_figure(replace(comparison, confidence=confidence)).axes[6]
     assert trusted.texts[0].get_text() == "Confidence" and np.all(trusted.get_images()[0].get_array() == 0.25)
+
+
+def test_the_truth_has_the_scale_of_the_scene(tmp_path, monkeypatch):
+    """Photos without exposure times tell radiance up to a factor."""
+    run, scene = make(tmp_path)
+    scene = replace(scene, views=tuple(replace(view, hdr=3 * view.hdr) for view in scene.views))
+    drawn = []
+    monkeypatch.setattr(write, "stops_figure", lambda comparison: drawn.append(comparison) or stops_figure(comparison))
+    monkeypatch.setattr(write, "report_page", lambda *_, **__: "")
+    write_report(run, scene, tmp_path / "report", evaluation={"protocol": {"aligned": {"scale": 3.0}}})
+    np.testing.assert_allclose(drawn[0].truth, drawn[0].hdr, rtol=1e-3)
 
 
 def test_each_photo_is_re_exposed_from_its_own_exposure(tmp_path):
