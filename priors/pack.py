@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.study import run
 from sehdr_warp.scene.images.hdr_files import read_hdr
 
-from .panoramas import ROOM_SIZE, WIDTH, half_size, listed_sources, to_rgbe, write_pack
+from .panoramas import ROOM_SIZE, WIDTH, half_size, listed_sources, to_differences, to_rgbe, write_pack
 
 LIGHTS = ("window", "spot", "lamps")
 STEPS = 256  # Of a curve, even in the cube root of exposure
@@ -26,10 +26,10 @@ def main(data: Path, pack: Path, /) -> None:
     write_pack(
         pack,
         {
-            "panoramas": np.stack(panoramas),
+            "panoramas": to_differences(np.stack(panoramas)),
             "held_out": np.array([source.held_out for source in sources]),
             "names": np.array([source.name for source in sources]),
-            "rooms": to_rgbe(np.stack(list(room_views(data)))),
+            "rooms": to_differences(to_rgbe(np.stack(list(room_views(data))))),
             "curves": curves(data / "crf" / "201_CRF_data.mat"),
         },
     )

@@ -1,6 +1,7 @@
 """Panoramas and rooms that the prior for clipped light is trained on: read from the listed sources, packed in one file.
 
-The pack holds radiance as RGBE (a mantissa of 8 bits for each channel, a shared exponent), which numpy alone can read.
+The pack holds radiance as RGBE (a mantissa of 8 bits for each channel, a shared exponent), which numpy alone can read,
+as differences, which compress better.
 """
 
 import tomllib
@@ -65,6 +66,22 @@ def from_rgbe(packed: np.ndarray) -> np.ndarray:
     return packed[..., :3].astype(np.float32) * np.exp2(packed[..., 3:].astype(np.float32) - 136.0)
 
 
+def to_differences(packed: np.ndarray) -> np.ndarray:
+    """Return [..., 4, H, W] uint8 of RGBE [..., H, W, 4]: red and blue less green, each less its left neighbor."""
+    planes = np.moveaxis(packed, -1, -3).copy()
+    planes[..., 0, :, :] -= planes[..., 1, :, :]
+    planes[..., 2, :, :] -= planes[..., 1, :, :]
+    return np.diff(planes, axis=-1, prepend=np.uint8(0))
+
+
+def from_differences(differences: np.ndarray) -> np.ndarray:
+    """Return the RGBE [..., H, W, 4] of to_differences."""
+    planes = np.cumsum(differences, -1, np.uint8)
+    planes[..., 0, :, :] += planes[..., 1, :, :]
+    planes[..., 2, :, :] += planes[..., 1, :, :]
+    return np.moveaxis(planes, -3, -1)
+
+
 def half_size(radiance: np.ndarray, width: int) -> np.ndarray:
     """Return an image [H, W, 3] averaged over whole blocks to the width; other sizes are resized first, by area."""
     height = radiance.shape[0] * width // radiance.shape[1]
@@ -81,7 +98,7 @@ def half_size(radiance: np.ndarray, width: int) -> np.ndarray:
 def read_pack(path: Path) -> Pack:
     """Return the arrays of a packed file."""
     with np.load(path) as arrays:
-        panoramas, rooms = from_rgbe(arrays["panoramas"]), from_rgbe(arrays["rooms"])
+        panoramas, rooms = (from_rgbe(from_differences(arrays[name])) for name in ("panoramas", "rooms"))
         return Pack(panoramas, arrays["held_out"], arrays["names"].tolist(), rooms, arrays["curves"])
 
 

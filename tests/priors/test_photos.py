@@ -1,5 +1,8 @@
 """Simulated photos of the prior's training: what clips has its truth, and a seed gives the same photos."""
 
+import tomllib
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +10,7 @@ import torch
 from priors import rooms
 from priors.families import FAMILIES, Families
 from priors.pack import curves
-from priors.panoramas import Pack, from_rgbe, listed_sources, to_rgbe
+from priors.panoramas import SOURCES, Pack, from_differences, from_rgbe, listed_sources, to_differences, to_rgbe
 from priors.photo_values import averaged
 from priors.photos import Camera
 
@@ -46,10 +49,16 @@ def test_rgbe_keeps_radiance_to_a_percent():
     assert (from_rgbe(to_rgbe(np.zeros((2, 3), np.float32))) == 0).all()
 
 
-def test_every_source_has_a_licence_and_some_are_held_out():
-    sources = listed_sources()
-    assert len({source.name for source in sources}) == len(sources) == 50
-    assert sum(source.held_out for source in sources) == 11
+def test_differences_keep_every_byte():
+    packed = np.random.default_rng(0).integers(0, 256, (3, 2, 8, 16, 4), dtype=np.uint8)
+    np.testing.assert_array_equal(from_differences(to_differences(packed)), packed)
+
+
+def test_some_sources_are_held_out_and_none_is_one_that_weights_are_checked_on():
+    sources, listed = listed_sources(), tomllib.loads(SOURCES.read_text())
+    assert len({source.name for source in sources}) == len(sources) == 107
+    assert sum(source.held_out for source in sources) == len(listed["held_out"]) == 11
+    assert not {Path(source.file).stem for source in sources} & {*listed["checked"], *listed["checked_more"]}
 
 
 def lamp_and_window(tmp_path, brighter: str) -> Pack:
