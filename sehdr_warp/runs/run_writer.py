@@ -185,7 +185,8 @@ class RunWriter(RunFolder):
             if new.is_dir():
                 results = self.summary_file, self.metrics, self.confidence, self.plan_file
                 settings = self.extension, self.orientation, self.light_unit
-                for file in (*results, *settings, self.scene_file, self.info_file, self.config_file):
+                events = self.tensorboard.glob("events.out.tfevents.*")  # TensorBoard would mix their curves.
+                for file in (*results, *settings, *events, self.scene_file, self.info_file, self.config_file):
                     file.unlink(missing_ok=True)
                 for checkpoint in self._checkpoint_folders():
                     remove_checkpoint(checkpoint)

@@ -167,7 +167,9 @@ class RunOutput:
     def _log(self, trainer: Trainer, split: str, figures: dict[str, float]) -> None:
         """Write figures to TensorBoard, if that is on."""
         if self._tensorboard:
-            self._writer = self._writer or summary_writer()(str(self.folder.tensorboard))
+            # Figures after the checkpoint that a training goes on from are hidden, because they are made again.
+            first = trainer.first_iteration + 1
+            self._writer = self._writer or summary_writer()(str(self.folder.tensorboard), purge_step=first)
             for name, value in figures.items():
                 self._writer.add_scalar(f"{split}/{name}", value, trainer.iteration)
 

@@ -251,7 +251,7 @@ def test_unknown_device_is_refused(scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_tensorboard_gets_the_figures_of_the_held_out_views(scene, tmp_path, monkeypatch):
+def test_tensorboard_gets_the_figures_of_the_last_training_in_a_folder(scene, tmp_path, monkeypatch):
     short = quick(**{"schedule.iterations": 4})
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "torch.utils.tensorboard", None)
@@ -261,11 +261,15 @@ def test_tensorboard_gets_the_figures_of_the_held_out_views(scene, tmp_path, mon
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    run = train(scene, tmp_path / "run", short, device="cpu", tensorboard=True)
-    events = EventAccumulator(str(run.path / "tensorboard")).Reload()
-    last = run.metrics()[-1]
-    written = events.Scalars("test/psnr_ldr")[-1]
-    assert written.step == last["iteration"] == 4 and abs(written.value - last["psnr_ldr"]) < 1e-3
+    train(scene, tmp_path / "run", quick(length=6), device="cpu", tensorboard=True)
+    notes = tmp_path / "run" / "tensorboard" / "notes.txt"
+    notes.write_text("mine")
+    run = train(scene, tmp_path / "run", short, device="cpu", tensorboard=True, overwrite=True)
+    figures = [
+        (event.step, event.value) for event in EventAccumulator(str(notes.parent)).Reload().Scalars("test/psnr_ldr")
+    ]
+    assert figures == [(line["iteration"], pytest.approx(line["psnr_ldr"], abs=1e-3)) for line in run.metrics()]
+    assert notes.read_text() == "mine"
 
 
 def test_held_out_figures_are_told_in_words(scene, tmp_path, logged):
