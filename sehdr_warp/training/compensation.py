@@ -6,6 +6,7 @@ scene.exposure.compensation, and only the components that clearly explain them a
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from ..scene.exposure.compensation import (
     initial_gains,
     remaining_vignetting,
     rough_gains,
+    unmeasured_reach,
 )
 from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
@@ -39,7 +41,8 @@ MIN_UNEXPLAINED_STOPS = 0.05
 """Smallest drift in stops, not explained by stated times or camera positions, for which stated times are corrected."""
 MAX_REMAINING_CROSS, MAX_REMAINING_WHITE_BALANCE = 0.95, 0.75
 """The same as MAX_REMAINING in cross validation: gains are fitted to half of the points and evaluated on the others.
-Used for corrections of stated times, beyond what stated times and positions explain, and of white balance. EXIF rounds
+Used for corrections of stated times, beyond what stated times and positions explain, and of white balance; and for
+vignetting, with MAX_REMAINING_VIGNETTING. EXIF rounds
 times and sensitivities, and cameras tone each photo by itself; shiny surfaces and a wrong response explain nothing at
 other points. Ground that is brighter from one side is explained by gains that grow along a flight, but there the
 harmonics represent it."""
@@ -128,29 +131,34 @@ def estimate_compensation(
     def fit(matched: MatchedPoints) -> ExposureCompensation:
         return fit_gains(views, others, matched.points, matched.visible, response)
 
-    def no_drift(matcher: Matcher) -> CompensationEstimate:
+    def no_drift(matcher: Matcher, matched: MatchedPoints) -> CompensationEstimate:
         least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
         reason = "do not contradict the stated times" if times_known else f"differ by less than {least}"
-        return CompensationEstimate(None, Decision({}, "none", f"matched points {reason}", COMPENSATION), matcher)
+        reason = f"matched points {reason}{_reach_note(views, matched, response)}"
+        if len(matched) < MIN_POINTS:
+            reason = f"{len(matched)} points match between the photos, too few to measure it"
+        return CompensationEstimate(None, Decision({}, "none", reason, COMPENSATION), matcher)
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=at_matching_size(views))
     matcher = matcher_of(small)
-    if times_known and not _may_drift(views, match(matcher, ROUGH_POINTS), response):
-        return no_drift(matcher)
+    if times_known and not _may_drift(views, rough := match(matcher, ROUGH_POINTS), response):
+        return no_drift(matcher, rough)
     matched, guess = match(matcher), initial_gains(small.views, response)
     if not times_known and len(matched) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
         matched = max(matched, match(matcher_of(guess.normalize_photos(small, response))), key=len)
     if len(matched) < MIN_POINTS:
-        return no_drift(matcher)
+        return no_drift(matcher, matched)
     compensation = fit(matched)
     components = _explanatory_components(compensation, views, matched, response, times_known)
     if not any(components):
-        return no_drift(matcher)
+        return no_drift(matcher, matched)
     # Match again in photos that are already similar: more points are found.
     matcher = matcher_of(compensation.parts(**components._asdict()).normalize_photos(small, response))
-    compensation = fit(match(matcher)).parts(**components._asdict())
-    return CompensationEstimate(compensation, _decision(compensation, components, times_known), None)
+    matched = match(matcher)
+    compensation = fit(matched).parts(**components._asdict())
+    decision = _decision(compensation, components, times_known, _reach_note(views, matched, response))
+    return CompensationEstimate(compensation, decision, None)
 
 
 def _may_drift(views: Sequence[View], matched: MatchedPoints, response: Response) -> bool:
@@ -177,22 +185,19 @@ def _explanatory_components(
     after = matched.disagreement(views, response, compensation.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
     exposure = white_balance = not times_known and compensation.stops >= MIN_STOPS and explains
+    validate = cache(lambda: _cross_validate(views, matched, response))
     if not exposure and (
         compensation.white_balance >= MIN_WHITE_BALANCE or (times_known and _exceeds_stated(compensation, views))
     ):
-        drift, colors = _cross_validate(views, matched, response)
         exposure = (
             times_known
             and compensation.unexplained_stops(views) >= MIN_UNEXPLAINED_STOPS
-            and drift <= MAX_REMAINING_CROSS
+            and validate().exposure <= MAX_REMAINING_CROSS
         )
         white_balance = (
             exposure or compensation.white_balance >= MIN_WHITE_BALANCE
-        ) and colors <= MAX_REMAINING_WHITE_BALANCE
-    vignetting = compensation.corner_loss >= MIN_CORNER_LOSS
-    if vignetting:
-        remaining = remaining_vignetting(views, matched.points, matched.visible, response, compensation)
-        vignetting = remaining <= MAX_REMAINING_VIGNETTING
+        ) and validate().white_balance <= MAX_REMAINING_WHITE_BALANCE
+    vignetting = compensation.corner_loss >= MIN_CORNER_LOSS and validate().vignetting <= MAX_REMAINING_VIGNETTING
     return Components(exposure, white_balance, vignetting)
 
 
@@ -204,17 +209,22 @@ def _exceeds_stated(compensation: ExposureCompensation, views: Sequence[View]) -
     )
 
 
-def _cross_validate(views: Sequence[View], matched: MatchedPoints, response: Response) -> tuple[float, float]:
-    """Return the fractions of the disagreement at half of the points that gains of the other half leave.
+class Remaining(NamedTuple):
+    """Fractions of the disagreement at half of the points that gains of the other half leave."""
 
-    Returns:
-        For exposure, relative to gains that follow stated times and positions; and for white balance, by colors.
-    """
+    exposure: float  # Relative to gains that follow stated times and positions
+    white_balance: float  # By colors
+    vignetting: float  # See remaining_vignetting()
+
+
+def _cross_validate(views: Sequence[View], matched: MatchedPoints, response: Response) -> Remaining:
+    """Return what gains that are fitted to half of the points leave at the other half; the mean of both ways."""
     halves, remaining = (slice(0, None, 2), slice(1, None, 2)), []
     for fitted, evaluated in (halves, halves[::-1]):
         rest = MatchedPoints(matched.points[evaluated], matched.visible[:, evaluated])
         visible = matched.visible[: len(views), fitted]
-        drift = fit_gains(views, (), matched.points[fitted], visible, response).parts(vignetting=False)
+        fit = fit_gains(views, (), matched.points[fitted], visible, response)
+        drift = fit.parts(vignetting=False)
         exposure = (
             rest.disagreement(views, response, drift),
             rest.disagreement(views, response, drift.explained_part(views)),
@@ -223,13 +233,21 @@ def _cross_validate(views: Sequence[View], matched: MatchedPoints, response: Res
             rest.disagreement(views, response, drift.parts(exposure=False), colors=True),
             rest.disagreement(views, response, None, colors=True),
         )
-        remaining.append([after / before if before else 1.0 for after, before in (exposure, colors)])
-    drift, colors = np.mean(remaining, 0)
-    return float(drift), float(colors)
+        vignetting = remaining_vignetting(views, rest.points, rest.visible[: len(views)], response, fit)
+        remaining.append([*(after / before if before else 1.0 for after, before in (exposure, colors)), vignetting])
+    return Remaining(*np.mean(remaining, 0).tolist())
 
 
-def _decision(compensation: ExposureCompensation, components: Components, times_known: bool) -> Decision:
-    """Return the line of the plan for gains that are corrected."""
+def _reach_note(views: Sequence[View], matched: MatchedPoints, response: Response) -> str:
+    """Return the end of the plan's line about photos whose vignetting is left out; empty if there are none."""
+    count, reach = unmeasured_reach(views, matched.points, matched.visible, response)
+    if not count:
+        return ""
+    return f"; vignetting of {count} photos is left out: their points reach {reach:.0%} of the way to the corners"
+
+
+def _decision(compensation: ExposureCompensation, components: Components, times_known: bool, note: str) -> Decision:
+    """Return the line of the plan for gains that are corrected, which ends with a note."""
     figures = []
     if components.exposure:
         figures.append(f"{compensation.stops:.2f} stops between photos")
@@ -239,4 +257,5 @@ def _decision(compensation: ExposureCompensation, components: Components, times_
         figures.append(f"{compensation.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if components.exposure else ", exposures stay as stated"
     choice = f"taken out of the photos{over if times_known else ''}"
-    return Decision({}, choice, f"matched points differ by {', '.join(figures)}", COMPENSATION, always_log=True)
+    reason = f"matched points differ by {', '.join(figures)}{note}"
+    return Decision({}, choice, reason, COMPENSATION, always_log=True)

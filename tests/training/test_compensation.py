@@ -78,6 +78,23 @@ def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
     assert "stay as stated" in decision.choice and drift.corner_loss == pytest.approx(0.5, abs=0.1) and not drift.stops
 
 
+def test_vignetting_that_points_do_not_reach_is_left_out_and_named(device):
+    """Masks leave the middle of photos, as of a dancer in a studio: the corners would be extrapolated."""
+    scene = drifting()[0]
+    row, column = np.mgrid[:64, :64] - 31.5
+    radius = np.hypot(row, column) / np.hypot(32, 32)
+    darkened = [codes_of(view.image * 0.5 ** (radius**2)[..., None], 8) for view in scene.views]
+    for reach, note in (
+        (0.5, "; vignetting of 9 photos is left out: their points reach 4"),
+        (2.0, "towards the corners"),
+    ):
+        mask = (radius < reach).astype(np.float32)
+        views = [replace(view, codes=codes, mask=mask) for view, codes in zip(scene.views, darkened, strict=True)]
+        drift, decision = found_in(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
+        assert drift.stops > 0.4 and note in decision.reason
+        assert (drift.corner_loss > 0.4) == (reach > 1)
+
+
 def test_times_that_a_camera_rounds_are_put_right(device):
     """EXIF rounds times and sensitivities: what photos differ by then is less than they differ by otherwise."""
     off = np.array([0.15, -0.2, 0.05, 0.1, -0.1, -0.15, 0.2, 0.0, -0.05])

@@ -18,6 +18,7 @@ from sehdr_warp.scene.exposure.compensation import (
     lens_groups,
     remaining_vignetting,
     rough_gains,
+    unmeasured_reach,
 )
 
 SIZE, PHOTOS = 48, 6
@@ -118,6 +119,22 @@ def test_each_lens_has_its_falloff(gains, points):
     rough = rough_gains(views, points, visible, SRGB)
     assert rough.corner_loss == pytest.approx(fitted.corner_loss, abs=0.1)
     assert remaining_vignetting(views, points, visible, SRGB, fitted) < 0.15
+
+
+def test_a_falloff_is_not_extrapolated_from_the_middle_of_photos(gains, points):
+    scene = photographed(gains, everywhere(VIGNETTING))
+    views, visible = scene.train_views, np.ones((PHOTOS, len(points)), bool)
+    assert unmeasured_reach(views, points, visible[:-1], SRGB) == (0, 0)
+    places = [view.camera.project(points) for view in scene.views]
+    middle = np.array(
+        [np.hypot(place.row - SIZE / 2, place.column - SIZE / 2) < 0.5 * np.hypot(24, 24) for place in places]
+    )
+    count, reach = unmeasured_reach(views, points, middle[:-1], SRGB)
+    assert count == PHOTOS - 1 and 0.4 < reach < 0.5
+    for fitted in (fit_gains(views, scene.test_views, points, middle, SRGB), rough_gains(views, points, middle, SRGB)):
+        assert fitted.corner_loss == 0
+        for view in views:
+            np.testing.assert_allclose(fitted.gains[view.name], gains[view.name], rtol=0.06)
 
 
 def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
