@@ -13,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from ..errors import SehdrError
 
 REFERENCE_ITERATIONS = 30_000  # Length of a training, as in 3DGS, that iteration numbers of a config refer to
+RESTART = 10.0
+"""Rate of the positions, as a multiple of the final one, at which a finished training goes on: 3DGS's half-way."""
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, le=100.0)]
@@ -286,6 +288,28 @@ class Config(_Table):
     def checkpoint_interval(self) -> int:
         """Iterations of this training between checkpoints."""
         return self.scaled(self.schedule.checkpoint_every)
+
+    def after(self, finished_at: int) -> "Config":
+        """Return the config for the steps that follow a training that was finished after `finished_at` iterations.
+
+        The scene must not become worse before it becomes better. So Gaussians are no longer relocated or added, the SH
+        degree stays, and positions learn at most at RESTART times their final rate, falling to it.
+        """
+        part = finished_at / self.schedule.iterations
+        if not 0 < part < 1:
+            return self
+        end = int(part * REFERENCE_ITERATIONS)
+        rates, densification, schedule = self.optimizer, self.densification, self.schedule
+        means = min(rates.means, rates.means_final * RESTART ** (1 / (1 - part)))
+        interval = min(schedule.sh_degree_interval, max(1, end // (self.model.sh_degree + 1)))
+        changed = {
+            "optimizer": rates.model_copy(update={"means": means}),
+            "densification": densification.model_copy(
+                update={"refine_stop_iter": min(densification.refine_stop_iter, end)}
+            ),
+            "schedule": schedule.model_copy(update={"sh_degree_interval": interval}),
+        }
+        return self.model_copy(update=changed)
 
     def degree_at(self, iteration: int) -> int:
         """Return the SH degree of step `iteration`, counted from 1: one more every sh_degree_interval."""

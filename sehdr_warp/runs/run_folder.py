@@ -8,7 +8,7 @@ metrics.jsonl               one line for each evaluation
 checkpoints/iteration_N/    tensors as safetensors, values as JSON with the hash of the tensors
 confidence.safetensors      how far photos support each Gaussian, and of which checkpoint
 summary.json                times, memory and counts, once the training has ended
-extension.json              more iterations than config.json has, of a training that was extended
+extension.json              more iterations than config.json has, of a training that was extended, and those it had
 orientation.json            up direction and scale of the files, set after the training
 light_unit.json             cd/m^2 of a radiance of 1, set after the training (`sehdr-warp meter`)
 blocks.json                 the blocks of a survey that the run was merged from
@@ -159,15 +159,24 @@ class RunFolder:
         }
 
     def read_config(self) -> Config:
-        """Return the config of the training, with the iterations that it was extended to."""
+        """Return the config of the training, with the iterations that it was extended to; see also finished_at()."""
         self.read_info()  # It names a run of another version as such.
         config = config_from_dict(read_object(self._no_link(self.config_file)), self.config_file)
         if not self.extension.is_file():
             return config
-        iterations = read_object(self._no_link(self.extension)).get("iterations")
-        if not isinstance(iterations, int) or iterations < config.schedule.iterations:
-            raise InputError(self.extension, f"iterations = {iterations!r:.40} is not usable", REMEDY)
+        iterations = self._extension("iterations", None, config.schedule.iterations)
         return override_config(config, {"schedule.iterations": iterations})
+
+    def finished_at(self) -> int:
+        """Return the iterations after which the training had finished before it was extended; 0 if it had not."""
+        return self._extension("finished_at", 0) if self.extension.is_file() else 0
+
+    def _extension(self, name: str, default: int | None, least: int = 0) -> int:
+        """Return a number of extension.json, or the default if a file of an earlier version lacks it."""
+        value = read_object(self._no_link(self.extension)).get(name, default)
+        if not isinstance(value, int) or value < least:
+            raise InputError(self.extension, f"{name} = {value!r:.40} is not usable", REMEDY)
+        return value
 
     def read_info(self) -> dict:
         """Return the values of run.json; see RunValues."""

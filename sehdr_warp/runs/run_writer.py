@@ -208,10 +208,13 @@ class RunWriter(RunFolder):
     def _is_empty(self) -> bool:
         return not {path.name for path in self.path.iterdir()} - {_LOCK}
 
-    def extend(self, iterations: int) -> None:
-        """Set more iterations for a training that goes on; its config and checkpoints stay as they are."""
+    def extend(self, iterations: int, finished_at: int) -> None:
+        """Set more iterations for a training that goes on; its config and checkpoints stay as they are.
+
+        finished_at: as RunFolder.finished_at() will return it.
+        """
         self._check_lock()
-        write_json(self.extension, {"iterations": iterations}, internal=True)
+        write_json(self.extension, {"iterations": iterations, "finished_at": finished_at}, internal=True)
 
     def write_summary(self, values: dict) -> None:
         """Write times, memory and counts of the training; see SummaryValues."""

@@ -190,15 +190,20 @@ def _resumed_trainer(
     compensation = exposure_compensation(info)
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     large_scene = checkpoint.values.get("large_scene")
-    trainer = Trainer(scene, saved, field, ranks=ranks, large_scene=large_scene)
+    finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
+    trainer = Trainer(scene, saved.after(finished_at), field, ranks=ranks, large_scene=large_scene)
     try:
         load_state(trainer, checkpoint)
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
         problem = f"its state does not fit ({error!r:.120})"
         raise InputError(checkpoint.path, problem, "remove it, or train again") from None
     if trainer.total > before:
-        folder.extend(trainer.total)
+        folder.extend(trainer.total, finished_at)
         text = "the schedule is stretched from %d to %d iterations: rates and densification are those of the longer one"
+        if finished_at == before:
+            text = (
+                "the finished training goes on from %d to %d iterations: positions learn slowly, no Gaussians are added"
+            )
         log.info(text, before, trainer.total)
     folder.rewind_metrics(trainer.iteration)
     return trainer

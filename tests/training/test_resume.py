@@ -17,7 +17,7 @@ from sehdr_warp.runs.run import field_from_checkpoint, load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
 from sehdr_warp.scene import response_choice
-from sehdr_warp.training.run_output import remove_unseen
+from sehdr_warp.training.run_output import evaluate_views, remove_unseen
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import load_state, state_of
@@ -240,6 +240,29 @@ def test_a_planned_run_that_was_stretched_is_resumed_with_its_preset(scene, tmp_
         trainer = create_trainer(scene, tmp_path / "run", resumed, device="cpu", resume=True)
         assert trainer.total == total
         trainer.output.folder.unlock()
+
+
+def test_a_finished_training_that_goes_on_for_much_longer_loses_nothing_first(scene, trained, tmp_path):
+    """And an interruption changes no bit of it, although it is not the schedule of its config."""
+    longer, runs = override_config(VARIANTS["default"], {"schedule.iterations": 300}), []
+    for name, stops in (("whole", ()), ("cut", (130, 170))):
+        shutil.copytree(trained("default"), tmp_path / name)
+        for stop in (*stops, 300):
+            trainer = create_trainer(without_truth(scene), tmp_path / name, longer, device="cpu", resume=True)
+            before = evaluate_views(trainer.field, scene.train_views, trainer.degree)["psnr_ldr"]
+            count = trainer.field.gaussians.count
+            assert trainer.degree == 1
+            for step in trainer:
+                assert step.gaussians == count
+                if step.iteration in (100, 190):
+                    after = evaluate_views(trainer.field, scene.train_views, trainer.degree)["psnr_ldr"]
+                    assert after > before - 0.3
+                if step.iteration == stop < 300:
+                    trainer.stop()
+            assert load_run(tmp_path / name).degree == 1
+        runs.append(RunFolder(tmp_path / name).newest_checkpoint())
+    whole, cut = runs
+    assert all(torch.equal(value, cut.tensors[name]) for name, value in whole.tensors.items())
 
 
 def test_a_field_that_a_damaged_plan_invents_is_named_with_the_file(scene, tmp_path):
