@@ -24,6 +24,7 @@ REACH = 3.0  # Gaussians join one light if they are nearer than this many median
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras, if nothing hides the light from there
 MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
+EXPECTED_CLIPPED = 0.9  # Of the share that clips if the scene is right, from which the darkest photo's white is certain
 UNOBSTRUCTED = 0.5  # Of what most views show of a light: those that show less count as obstructed
 MOST_LIGHTS, MOST_VIEWS = 64, 24  # MOST_VIEWS of the longest exposures, and of those of half of these or less
 LEAST_ROWS, MOST_ROWS = 128, 724
@@ -40,7 +41,8 @@ class Light:
         radiance: [3] in the field's colors; with the shape it gives the light that training views show, of those
             from which nothing hides it. If each view cuts the light off at its border, it is what reaches the place of
             the one that shows most of it.
-        lower_bound: [3] certain radiance: the photos' white, or less where the light has less of a color.
+        lower_bound: [3] certain radiance: the white of the darkest photos that clip it, or less where it has less of a
+            color.
         deviation: of log2 radiance, stops, of what photos clip; None if that was not measured. Edges and colors that do
             not clip do not count, because all its photos may err alike; where photos of half the exposure or less do
             not clip, it is at most MEASURED_STOPS, or what the scene differs from unclipped values.
@@ -152,7 +154,7 @@ def find_lights(
             continue
         deviation = _deviation(group, float(photos.measurable[light_photos.photos].max()))
         share = float(reaches_middle[group.index].sum()) / total
-        bound = np.minimum(photos.white, radiance)
+        bound = np.minimum(_certain_radiance(group, photos), radiance)
         lights.append(Light(shape, radiance, bound, deviation, share, group.index))
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
 
@@ -314,6 +316,19 @@ def _deviation(group: _Candidates, measurable: float) -> float | None:
     misfit = np.maximum(group.doubt - group.stops, 0) / np.maximum(1 - group.clipped, 1e-6)
     stops = np.where(group.brightness < measurable, np.minimum(stops, np.maximum(misfit, MEASURED_STOPS)), stops)
     return float(np.average(stops, weights=group.weights * clipped))
+
+
+def _certain_radiance(group: _Candidates, photos: _Photos) -> np.ndarray:
+    """Return the mean radiance [3] up to the white of the darkest photos that clip each Gaussian of a light."""
+    angles = group.angles.sum(0)
+    radiance = group.light.sum(0) / np.maximum(angles, 1e-30)[:, None]
+    clips = (group.angles > 0)[..., None] & (radiance > photos.whites[:, None, None])
+    expected = (clips.mean(2) * group.angles).sum(0) / np.maximum(angles, 1e-30)
+    darkest = np.where(clips, photos.whites[:, None, None], 0.0).max(0)
+    # If fewer values clip, the scene is brighter than some photos.
+    sure = np.where((group.clipped >= EXPECTED_CLIPPED * expected)[:, None], darkest, 0.0)
+    bound = np.minimum(np.maximum(sure, photos.white), radiance)
+    return np.average(bound, axis=0, weights=np.maximum(angles, 1e-30))
 
 
 def _reference_white(whites: np.ndarray, radiance: Tensor, pixels: Tensor) -> float:

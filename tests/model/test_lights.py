@@ -243,6 +243,18 @@ def test_lights_are_listed_with_their_energy_however_many_photos_are_dark(lamps,
     assert [light.deviation for light in lights] == pytest.approx([0.25 if dark else 1.0] * count, abs=0.01)
 
 
+@pytest.mark.parametrize("darker, bound", [(1, (1, 1, 1)), (8, (8, 8, 8)), (25, (25, 25, 1))])
+def test_a_darker_photo_that_clips_raises_the_lower_bound(darker, bound):
+    scene = field(panel(), RADIANCE, 0.03)
+    shots = [(camera, 1.0 if index % 2 else 1 / darker) for index, (camera, _) in enumerate(small_views())]
+    (light,) = find_lights(scene, photograph(scene, shots), shots)
+    assert light.lower_bound == pytest.approx(bound, rel=0.15)  # Pixels at its edge clip in fewer photos.
+    # A scene that is twice as bright as the photos, of which the darker ones then clip nothing
+    bright = field(panel(), 2 * RADIANCE, 0.03)
+    (light,) = find_lights(bright, photograph(bright, shots, field(panel(), (7, 7, 7), 0.03)), shots)
+    assert light.lower_bound == pytest.approx((1, 1, 1), rel=0.05)
+
+
 def test_errors_of_unclipped_values_count_if_these_measure_a_light():
     """The scene has a quarter of the light that six dark photos show. Six others clip it."""
     scene, truth = field(panel(), RADIANCE / 8, 0.03), field(panel(), RADIANCE / 2, 0.03)
