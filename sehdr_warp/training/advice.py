@@ -12,6 +12,7 @@ from ..runs.scene_description import FOUND
 from ..runs.values import LOAD_OPTIONS, LoadArguments
 from ..scene.pose_conventions import MISFIT
 from ..subsets import first_names
+from .plan import STEPS_PER_PHOTO
 
 if TYPE_CHECKING:
     from .trainer import Trainer
@@ -113,13 +114,15 @@ def advice(
             f"{unplaced} photos have no camera and are not in the scene; photos from places between them and the "
             f"{train_photos} others would help most: {again}"
         )
-    if len(points) >= 3:
+    is_long = iterations >= STEPS_PER_PHOTO * train_photos  # Blur has gone away, however few evaluations show it.
+    if len(points) >= 3 or (points and is_long):
         since = iterations * 2 / 3 + 1
         if any(point.iteration == resumed_at for point in points):  # Its schedule had ended there.
             since = max(since, resumed_at)
         earlier = [point for point in points[:-1] if point.iteration <= since] or points[:1]
         before = max(earlier, key=attrgetter("psnr"))
-        gain = points[-1].psnr - before.psnr
+        if before.iteration >= iterations / 3 or not is_long:
+            gain = points[-1].psnr - before.psnr
         if gain < UNFINISHED and not few_placed and (best := max(point.psnr for point in points)) < FAILED:
             remedy = "photos from places between them would help most"
             remedy += f"; or find their cameras anew {anew}" if posed else f": {again}"
@@ -140,7 +143,7 @@ def advice(
             lines.append(
                 f"{train_photos} photos are few: more from places between them, and nearer, would help most: {again}"
             )
-    if gain < UNFINISHED and len(points) not in (1, 2):  # Too few to show whether blur is still going away.
+    if gain < UNFINISHED and (is_long or len(points) not in (1, 2)):  # Few do not show whether blur still goes away.
         if jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
             lines.append(jump)
         elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.

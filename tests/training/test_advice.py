@@ -87,6 +87,19 @@ def test_a_training_that_is_too_short_blames_nothing_that_moved():
     assert advice(Path("r"), summary([12, 13], regions=100) | {"brightness_offsets": {"p0": 0.9}}, 10) == []
 
 
+def test_a_long_training_gets_advice_after_one_or_two_evaluations():
+    for decibels in ([28], [20, 28]):  # 90 steps on one photo, the first evaluation at half of them
+        figures = summary(decibels, regions=100)
+        if len(decibels) == 2:
+            assert "gained 8.0 dB since iteration 45" in advice(Path("r"), figures, 1)[0]
+            figures["metrics"][0]["iteration"] = 5  # Says nothing of the end
+        [line] = advice(Path("r"), figures, 1)
+        assert "masks/PHOTO.png" in line
+        [line] = advice(Path("r"), figures | {"brightness_offsets": {"p0": 0.9}}, 1)
+        assert line.startswith("1 photo is brighter or darker")
+    assert "does not fit" in advice(Path("r"), summary([13]), 1)[0]
+
+
 def test_few_photos_and_movement():
     assert "photos are few" in advice(Path("r"), summary([20, 21, 21.05]), 8)[0]
     [line] = advice(Path("r"), summary([28, 28, 28], regions=100), 10)
@@ -137,7 +150,7 @@ def test_a_finished_run_goes_on_with_more_iterations(tmp_path, logged):
     run = train(toy_scene(), tmp_path / "run", config | {"schedule.iterations": 48}, device="cpu", resume=True)
     assert run.iterations == 48 and run.summary()["finished"] and run.summary()["iteration"] == 48
     assert load_run(tmp_path / "run").config.schedule.iterations == 48
-    assert any("stretched from 24 to 48 iterations" in line for line in logged)
+    assert any("the finished training goes on from 24 to 48 iterations" in line for line in logged)
     assert [line["iteration"] for line in run.metrics()][: len(first)] == [line["iteration"] for line in first]
     # Without a config it is the longer training that is resumed, which has ended.
     assert train(toy_scene(), tmp_path / "run", device="cpu", resume=True).iterations == 48
