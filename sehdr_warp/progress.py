@@ -111,9 +111,17 @@ def display_stages(display: Display) -> Iterator[None]:
 
 
 def format_seconds(seconds: float | None) -> str:
-    """Return `1:23` or `1:02:03`, or `-:--` for None."""
+    """Return a clock, which may count down: `1:23` or `1:02:03`, or `-:--` for None."""
     if seconds is None:
         return "-:--"
     minutes, seconds_part = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{seconds_part:02}" if hours else f"{minutes}:{seconds_part:02}"
+
+
+def format_duration(seconds: float) -> str:
+    """Return a duration in words of one unit, such as `45 s`, `3.3 min` or `2.1 h`."""
+    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}" if seconds < 20 * size else f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

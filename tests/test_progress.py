@@ -55,3 +55,10 @@ def test_quiet_shows_nothing():
 @pytest.mark.parametrize("seconds,text", [(None, "-:--"), (5, "0:05"), (63.4, "1:03"), (3723, "1:02:03")])
 def test_seconds_are_minutes_and_hours(seconds, text):
     assert progress.format_seconds(seconds) == text
+
+
+@pytest.mark.parametrize(
+    "seconds, text", [(5, "5 s"), (119, "119 s"), (130, "2.2 min"), (3 * 3600, "3.0 h"), (30 * 86400, "30 days")]
+)
+def test_durations_have_one_unit(seconds, text):
+    assert progress.format_duration(seconds) == text

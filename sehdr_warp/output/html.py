@@ -83,11 +83,3 @@ def whole_page(title: str, style: str, body: Markup, scripts: Sequence[str], *, 
         body=body,
         scripts=join((markup("<script>{}</script>", Markup(text)) for text in scripts), "\n"),
     )
-
-
-def duration(time: float) -> str:
-    """Format seconds as `45 s`, `3 min 20 s` or `2 h 5 min`."""
-    minutes, rest = divmod(round(time), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s" if minutes else f"{rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"

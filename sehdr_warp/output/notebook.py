@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .html import duration, markup, page_file, whole_page
+from ..progress import format_duration
+from .html import markup, page_file, whole_page
 from .images.ldr_files import as_array
 from .images.tonemap import display_gain
 from .light_pictures import dial
@@ -22,7 +23,7 @@ def run_html(run: "Run") -> str:
     """Return HTML of a run: one frame with all it needs, which static pages of a notebook show too."""
     entries = run.cameras
     opening = next((entry for entry in entries if entry.split == "test"), entries[0] if entries else None)
-    figures = [f"{run.gaussian_count:,} Gaussians", f"{run.iterations} steps", duration(run.train_seconds)]
+    figures = [f"{run.gaussian_count:,} Gaussians", f"{run.iterations} steps", format_duration(run.train_seconds)]
     scores = [line["psnr_ldr"] for line in run.metrics() if "psnr_ldr" in line]
     figures += [f"held-out PSNR {score:.1f} dB" for score in scores[-1:]]
     figures += [f"view {opening.name}"] if opening else []

@@ -12,6 +12,7 @@ import torch
 
 from ..limits import format_bytes
 from ..parallel import thread_count
+from ..progress import format_duration
 
 STEP_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 2.0e-4, 3.4e-10, 2.4e-9
 """Duration of a captured step on one GPU: fixed part, per pixel of a photo, per Gaussian, with densification."""
@@ -194,11 +195,3 @@ def recommend(whole: Workload, divided: Workload, blocks: int, memory: float | N
     if gpus > 1 and alone.seconds > SAVES * several.seconds:
         return f"--gpus {gpus}: {alone.seconds / several.seconds:.1f} times as fast as one"
     return "one GPU: " + ("more gain little" if gpus > 1 else "the set is one training")
-
-
-def format_duration(seconds: float) -> str:
-    """Return a duration in words of one unit."""
-    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.1f} {unit}" if seconds < 20 * size else f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"

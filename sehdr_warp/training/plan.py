@@ -13,12 +13,13 @@ import torch
 from ..errors import InputError, refuse_paths
 from ..model.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
+from ..progress import format_duration
 from ..runs.config import Config, McmcConfig, OptimizerConfig
 from ..runs.config_files import as_config, override_config
 from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.photos import FEWEST_PHOTOS
-from .cost import CPU_GAUSSIAN, CPU_PIXEL, format_duration
+from .cost import CPU_GAUSSIAN, CPU_PIXEL
 from .initialization import base_time, start_count
 from .scene_facts import LARGE_SCENE, SceneFacts, largest_hdr_truth, measure_scene
 from .strategies import mcmc_cap

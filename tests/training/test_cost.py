@@ -18,7 +18,6 @@ from sehdr_warp.training.cost import (
     block_cost,
     choices,
     exchange_seconds,
-    format_duration,
     recommend,
     step_seconds,
     training_cost,
@@ -132,13 +131,3 @@ def test_gpus_that_gain_nothing_are_not_listed_unless_they_are_named():
     assert [choice.name for choice in choices(quick, quick, 1, None, 4)] == ["1 GPU", "4 GPUs"]
     long = replace(quick, pixels=2e6, gaussians=1e6, iterations=30_000)
     assert len(choices(long, long, 1, None)) == 5
-
-
-def test_durations():
-    assert [format_duration(value) for value in (5, 119, 130, 3600 * 3, 86400 * 30)] == [
-        "5 s",
-        "119 s",
-        "2.2 min",
-        "3.0 h",
-        "30 days",
-    ]

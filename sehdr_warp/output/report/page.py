@@ -9,11 +9,12 @@ from markupsafe import Markup
 
 from ... import __version__
 from ...model.lights import Light, light_name
+from ...progress import format_duration
 from ...scene import Scene
 from ...scene.camera import limited_size
 from ...scene.exposure.times import shutter
 from ...scene.images.downsampling import area_average
-from ..html import EMPTY, duration, join, markup, page_file, whole_page, with_code
+from ..html import EMPTY, join, markup, page_file, whole_page, with_code
 from ..images.ldr_files import jpeg
 from ..images.tonemap import expose, fit_tone_map
 from ..images.ultra_hdr import MOST_STOPS, ultra_hdr
@@ -105,7 +106,7 @@ def _header(run: "Run", scene: Scene, opening: Markup) -> Markup:
         "response": run.response.name,
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,
-        "training": duration(run.train_seconds),
+        "training": format_duration(run.train_seconds),
         "radiance of 1, cd/m\N{SUPERSCRIPT TWO}": None if (unit := luminance_of_one(run)) is None else f"{unit:.4g}",
         "held-out photos": _decibels(last, "psnr_ldr"),
         "held-out HDR, mu-law": _decibels(last, "psnr_mu"),

@@ -78,7 +78,7 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     assert headings(text) == [*expected, "What was left out, and why", "Figures", "Error against time", "Cameras"]
     assert "<li>a note of <code>the training</code></li>" in text
     assert text.index("<h2>Light above white") < text.index('class="facts"') < text.index("<h2>Photo, scene, truth")
-    for checked in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "1 min 5 s", "+1.2<", "\N{MINUS SIGN}2<"):
+    for checked in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "65 s", "+1.2<", "\N{MINUS SIGN}2<"):
         assert checked in text
     assert '<rect x="3.8" y="5.8"' in text  # Around the box, by three units of a 32-pixel photo
 
