@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 LAYOUTS = ("latlong", "cube")
 SUFFIXES = (".exr", ".hdr")
+LEAST_VISIBLE = 1e-3  # Share of all directions below which nothing counts as visible from a point
 COVERED = 0.5  # Alpha above which a direction counts as covered
 _LEAST_COVERED = 0.1  # Covered share of all directions below which a warning names the point
 _NEAR = 0.02  # Spread of the cameras: surfaces that near in most directions mean that the point is inside something
@@ -113,7 +114,7 @@ def write_environment_map(
     what = {"beyond": center.beyond, "shares": run.clipped_share()}
     rendered = render_map(run, center.position, size, layout, transform.rotation, focal, **what)
     weight, place = solid_angles(size, layout), transform.points(center.position)
-    _judge(run, place, photos, rendered.alpha, rendered.distance, weight)
+    _judge(run, center, place, photos, rendered.alpha, rendered.distance, weight)
     added = np.zeros_like(rendered.hdr)
     if inpaint:
         directions = map_directions(size, layout) @ transform.rotation
@@ -347,8 +348,19 @@ def inpainted_light(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, 
     return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)
 
 
+def nothing_visible(run: "RenderableScene", center: MapCenter, point: np.ndarray) -> str:
+    """Return what to say if next to nothing is visible from a center, which is `point` [3] as `--at` takes it."""
+    remedy = "choose a point among the cameras (center, camera:NAME)" + " or a smaller --beyond" * (center.beyond > 0)
+    return f"{run.path}: from ({_place(point)}) nothing of the scene is seen; {remedy}"
+
+
+def _place(point: np.ndarray) -> str:
+    return ", ".join(f"{value:.4g}" for value in np.round(point, 6) + 0.0)
+
+
 def _judge(
     run: "RenderableScene",
+    center: MapCenter,
     point: np.ndarray,
     photos: list[Camera],
     alpha: np.ndarray,
@@ -357,14 +369,12 @@ def _judge(
 ) -> None:
     """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is.
 
-    `point` [3] is as `--at` takes it, for messages. The spread of the photos' cameras says what is near. `alpha`,
-    `distance` (scene units) and `weight` (solid angles) are those of the map's pixels, [H, W].
+    `point` [3] is the center as `--at` takes it, for messages. The spread of the photos' cameras says what is near.
+    `alpha`, `distance` (scene units) and `weight` (solid angles) are those of the map's pixels, [H, W].
     """
-    share = weight[alpha > COVERED].sum() / weight.sum()
-    place = ", ".join(f"{value:.4g}" for value in point)
-    if share < 1e-3:
-        remedy = "choose a point among the cameras (center, camera:NAME)"
-        raise SehdrError(f"{run.path}: from ({place}) nothing of the scene is seen; {remedy}")
+    share, place = float(weight[alpha > COVERED].sum() / weight.sum()), _place(point)
+    if share < LEAST_VISIBLE:
+        raise SehdrError(nothing_visible(run, center, point))
     if share < _LEAST_COVERED:
         log.warning("from (%s) only %.1f %% of all directions are seen: is it within the scene?", place, 100 * share)
     spread = np.linalg.norm(np.ptp([camera.position for camera in photos], axis=0)) if len(photos) > 1 else 0.0

@@ -12,7 +12,7 @@ import torch
 
 from ...errors import SehdrError, refuse_paths
 from ...files import atomic_path, check_absent
-from ...model.lights import Light, light_name, received_light
+from ...model.lights import Light, ReceivedLight, light_name, received_light
 from ...scene.wide_camera import typical_focal_length
 from ...subsets import first_names
 from ..cameras.scene_cameras import training_cameras
@@ -21,7 +21,16 @@ from ..images.ldr_files import as_array
 from ..images.tonemap import exposure_of_white
 from ..picture_header import provenance
 from ..world_transform import WorldTransform, world_transform
-from .environment_map import COVERED, inpainted_light, latlong, map_header, render_map, solid_angles
+from .environment_map import (
+    COVERED,
+    LEAST_VISIBLE,
+    inpainted_light,
+    latlong,
+    map_header,
+    nothing_visible,
+    render_map,
+    solid_angles,
+)
 from .map_center import MapCenter, find_center
 from .unit import luminance_of_one
 
@@ -134,7 +143,10 @@ def write_lights(
         text = "%s: in cd/m^2; a value of 1 in plates is %.4g of them, and --reference-white puts all in one unit"
         log.info(text, path.name, luminance)
     units = f"{unit}, linear Rec.709"
-    lights = lights_as_received(run, run.find_lights(), center)
+    received = _received_at(run, center)
+    if float(received.angles.sum()) < 4 * np.pi * LEAST_VISIBLE:
+        log.warning("%s", nothing_visible(run, center, transform.points(center.position)))
+    lights = lights_as_received(run, run.find_lights(), center, received)
     if not lights:
         text = "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest"
         log.warning(text, run.path)
@@ -157,15 +169,21 @@ def write_lights(
     return files
 
 
-def lights_as_received(run: "RenderableScene", lights: Sequence[Light], center: MapCenter) -> list[Light]:
+def _received_at(run: "RenderableScene", center: MapCenter) -> ReceivedLight:
+    focal = typical_focal_length(training_cameras(run))
+    return received_light(run.field, center.position, focal, beyond=center.beyond, degree=run.degree)
+
+
+def lights_as_received(
+    run: "RenderableScene", lights: Sequence[Light], center: MapCenter, received: ReceivedLight | None = None
+) -> list[Light]:
     """Return lights with the radiance that gives, with their shapes, the light that a place receives of each.
 
-    A lamp whose shade hides it from there becomes dimmer. A rectangle that faces away stays as it is.
+    A lamp whose shade hides it from there becomes dimmer. A rectangle that faces away stays as it is. `received` is
+    what the place receives, which is measured by default.
     """
-    if not lights:
-        return []
-    focal = typical_focal_length(training_cameras(run))
-    received = received_light(run.field, center.position, focal, beyond=center.beyond, degree=run.degree)
+    if received is None:
+        received = _received_at(run, center)
     result = []
     for light in lights:
         angle, of_members = light.shape.solid_angle(center.position), received.angles[light.members, None]

@@ -126,6 +126,17 @@ def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, 
     assert filled[unseen].min() > 0.5 * lit.min() and filled[unseen].max() < 1.01 * lit.max()
 
 
+def test_a_line_names_a_place_from_which_nothing_is_visible(tmp_path, run, monkeypatch, logged):
+    monkeypatch.undo()
+    write_lights(run, tmp_path / "a.json", axes="scene")
+    assert "nothing of the scene" not in "\n".join(logged)
+    write_lights(run, tmp_path / "b.json", axes="scene", at=(-1e-17, 0, 0), beyond=1e6)
+    write_lights(run, tmp_path / "c.json", axes="scene", at=(1e5, 0, 0))
+    near, far = (line for line in logged if "nothing of the scene is seen" in line)
+    assert "from (0, 0, 0) " in near and near.endswith(" or a smaller --beyond")
+    assert "from (1e+05, 0, 0) " in far and far.endswith("camera:NAME)")
+
+
 def test_the_map_is_taken_where_an_object_stands(tmp_path, run):
     run.find_lights = list
     place = {"at": (0.5, 0.2, 1.0), "beyond": 4.3, "axes": "scene"}  # One lamp is nearer.
