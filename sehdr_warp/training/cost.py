@@ -131,11 +131,16 @@ def block_cost(work: Workload, blocks: int, gpus: int = 1) -> Cost:
     )
 
 
+def cpu_seconds(pixels: float, gaussians: float, threads: int) -> float:
+    """Return the mean duration of a step on the CPU of a training that ends with so many Gaussians, seconds."""
+    return (CPU_PIXEL * pixels + CPU_GAUSSIAN * gaussians / GROWTH) / threads
+
+
 def cpu_cost(work: Workload, threads: int) -> Cost:
     """Return the cost of a training on the CPU."""
-    step = (CPU_PIXEL * work.pixels + CPU_GAUSSIAN * work.gaussians / GROWTH) / threads
     photos = work.photos * work.pixels * work.pixel_bytes
-    return Cost(step * work.iterations, 0.0, 0.0, STATE_BYTES * work.gaussians, photos, False)
+    seconds = work.iterations * cpu_seconds(work.pixels, work.gaussians, threads)
+    return Cost(seconds, 0.0, 0.0, STATE_BYTES * work.gaussians, photos, False)
 
 
 @dataclass(frozen=True)

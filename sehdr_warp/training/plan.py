@@ -19,7 +19,7 @@ from ..runs.config_files import as_config, override_config
 from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.photos import FEWEST_PHOTOS
-from .cost import CPU_GAUSSIAN, CPU_PIXEL
+from .cost import cpu_seconds
 from .initialization import base_time, start_count
 from .scene_facts import LARGE_SCENE, SceneFacts, largest_hdr_truth, measure_scene
 from .strategies import mcmc_cap
@@ -365,12 +365,6 @@ RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Decision]] = {
 
 
 def cpu_step_seconds(facts: SceneFacts, config: Config) -> float:
-    """Return the approximate duration of a step on this machine's CPU.
-
-    It is that of two thirds of the final number of Gaussians: the mean over a training that grows for half of its
-    steps.
-    """
-    start = max(facts.points, start_count(config, facts.pixels))
-    count = max(start, mcmc_cap(config, facts.pixels))
-    work = CPU_PIXEL * facts.pixels / facts.photos + CPU_GAUSSIAN * min(count, config.densification.cap_max) / 1.5
-    return work / thread_count()
+    """Return the approximate mean duration of a step on this machine's CPU."""
+    count = max(facts.points, start_count(config, facts.pixels), mcmc_cap(config, facts.pixels))
+    return cpu_seconds(facts.pixels / facts.photos, min(count, config.densification.cap_max), thread_count())
