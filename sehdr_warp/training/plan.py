@@ -304,8 +304,8 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Deci
             reason = f"about {format_duration(seconds)} on a CPU with {thread_count()} threads; --iterations for more"
             if seconds > 2 * CPU_SECONDS:
                 reason += ", --max-size for smaller photos and less time"
-        if number < sharp:
-            each = f"about {number / facts.photos:.0f} steps on each of {facts.photos} photos leave the scene blurred"
+        if round(number / facts.photos) < CPU_STEPS_PER_PHOTO:
+            each = f"about {number / facts.photos:.1f} steps on each of {facts.photos} photos leave the scene blurred"
             if sharp >= FEWEST_ITERATIONS and config.mcmc.cap_density == CPU_CAP_DENSITY:  # See _is_short_of_time().
                 step = cpu_step_seconds(facts, override_config(config, {"mcmc.cap_density": McmcConfig().cap_density}))
             reason += f"; {each}: --iterations {sharp} takes about {format_duration(sharp * step)}"

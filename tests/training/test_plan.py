@@ -232,7 +232,7 @@ def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
     assert 1000 < some.fields["schedule.iterations"] <= 15_000
     assert cpu_step_seconds(large, config) > 50 * cpu_step_seconds(small, config)
     assert (
-        "about 5 steps on each of 200 photos leave the scene blurred: --iterations 2000 takes about 117 min"
+        "about 5.0 steps on each of 200 photos leave the scene blurred: --iterations 2000 takes about 117 min"
         in few.reason
     )
     # A photo has ten steps if they take minutes; where they do without that, the time stays what it was.
@@ -240,9 +240,11 @@ def test_a_cpu_gets_the_iterations_that_fit_into_minutes(facts, monkeypatch):
     walk, usual, town = (rule(size, config_of(mcmc__cap_density=60.0), CPU) for size in sizes)
     assert walk.fields == {"schedule.iterations": 2700} and usual.fields == {"schedule.iterations": 1000}
     assert walk.reason.startswith("about 4.7 min on a CPU") and "blurred" not in walk.reason + usual.reason
+    nearly = rule(replace(facts, photos=264, pixels=264 * 126_000), config_of(mcmc__cap_density=60.0), CPU)
+    assert nearly.fields == {"schedule.iterations": 2600} and "blurred" not in nearly.reason
     # More than 4000 steps that are asked for get twice the Gaussians, and take longer.
     assert town.reason.endswith(
-        "7 steps on each of 600 photos leave the scene blurred: --iterations 6000 takes about 28 min"
+        "6.8 steps on each of 600 photos leave the scene blurred: --iterations 6000 takes about 28 min"
     )
 
 
