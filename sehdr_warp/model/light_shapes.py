@@ -78,7 +78,7 @@ def fitted_shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray,
     # A Gaussian reaches beyond its center on the light's face, but not across a flat one.
     spread = float(weights @ widths**2)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1].T
-    if values[2] < FLATNESS * np.sqrt(values[0] * values[1]) and values[1] > spread:
+    if values[2] < FLATNESS * np.sqrt(values[0] * values[1]) and 2 * values[1] > spread:
         normal = vectors[2] if vectors[2] @ (viewer - position) >= 0 else -vectors[2]
     elif values[1] < FLATNESS * values[0] and values[0] > spread:
         normal = viewer - position

@@ -93,6 +93,8 @@ def test_a_window_of_uncertain_depth_is_a_rectangle_and_half_a_ball_a_sphere():
     window = fitted_shape(places, np.full(len(places), 0.05), np.ones(len(places)), np.zeros(3))
     assert window.kind == "rect" and window.size == pytest.approx((1.2, 0.6), rel=0.1)
     assert window.axes[2] == pytest.approx([0, 0, -1], abs=0.1)
+    large = fitted_shape(places, np.full(len(places), 0.2), np.ones(len(places)), np.zeros(3))
+    assert large.kind == "rect" and large.axes[2] == pytest.approx([0, 0, -1], abs=0.1)
     half = ball((0, 0, 4))
     half = half[half[:, 2] < 4]
     assert fitted_shape(half, np.full(len(half), 0.03), 4 - half[:, 2], np.zeros(3)).kind == "sphere"
