@@ -199,7 +199,7 @@ def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
     assert lines[0].startswith(f"{run}: 30 iterations, ")
     assert re.search(r", held-out photos [\d.]+ dB, HDR [\d.]+ dB \(mu-law\), [\d.]+ s on cpu", lines[0])
     assert len(lines) >= 4 and all(
-        f"sehdr-warp {word} {run}" in "".join(lines) for word in ("view", "render", "report", "export")
+        f"sehdr-warp {word} {run}" in "".join(lines) for word in ("view", "render", "lights", "report", "export")
     )
 
 

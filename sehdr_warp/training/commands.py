@@ -362,4 +362,5 @@ def _ending(path: Path, summary: dict) -> str:
 look at it:         sehdr-warp view {run}
 page to send:       sehdr-warp export {run} --out scene.html
 exposure brackets:  sehdr-warp render {run} --out {views}{cameras} --evs=-4,-2,0,2,4
+lamps and windows:  sehdr-warp lights {run}
 pictures, splats:   sehdr-warp report {run} --out {report};  sehdr-warp export {run} --out scene.ply"""
