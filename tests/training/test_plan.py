@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.runs.config import ScheduleConfig
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Camera, codes_of, look_at
@@ -284,7 +285,8 @@ def test_what_the_user_gave_stays(scene):
     assert plan.user_fields == {"schedule.iterations": 9000}
     assert "schedule.iterations" not in fields(plan)
     assert "set by you: schedule.iterations = 9000" in plan.table()
-    for mapping in ({"schedule.iterations": 9000, "seed": 1}, {"schedule": {"iterations": 9000}}):
+    tables = {"iterations": 9000}, ScheduleConfig(iterations=9000)
+    for mapping in ({"schedule.iterations": 9000, "seed": 1}, *({"schedule": table} for table in tables)):
         assert make_plan(scene, mapping).config.schedule.iterations == 9000
 
 
