@@ -86,7 +86,7 @@ def train(
     matrices, vectors = ([p for p in network.parameters() if (p.ndim > 1) is matrix] for matrix in (True, False))
     groups = [{"params": matrices, "weight_decay": WEIGHT_DECAY}, {"params": vectors, "weight_decay": 0.0}]
     optimizer = torch.optim.AdamW(groups, rate)
-    decay = min(AVERAGE, 1 - 10 / steps)
+    decay = max(0.0, min(AVERAGE, 1 - 10 / steps))
     average = torch.optim.swa_utils.AveragedModel(
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(decay)
     )
