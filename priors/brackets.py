@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.results import new_result
 from benchmarks.study import run
 from sehdr_warp.errors import InputError
 from sehdr_warp.prior import load_prior
@@ -157,8 +158,8 @@ def main(stacks: Path, /, out: Path, weights: Path | None = None) -> None:
         "slope": float(product / max(true, 1e-9)),
         "correlation": float(product / max((true * estimated) ** 0.5, 1e-9)),
     }
-    result = {"rows": rows_by_share(photos), "colors": colors, "photos": photos}
-    out.write_text(json.dumps(result))
+    result = new_result("prior on exposure stacks", torch.device("cpu"), {})
+    out.write_text(json.dumps(result | {"rows": rows_by_share(photos), "colors": colors, "photos": photos}))
 
 
 def _codes(path: Path) -> np.ndarray:

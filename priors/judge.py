@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.results import new_result
 from benchmarks.study import run
 from sehdr_warp.prior import load_prior
 from sehdr_warp.prior.network import STOPS, LightNetwork, network_input
@@ -122,7 +123,8 @@ def main(pack: Path, weights: Path, /, out: Path, folder: Path | None = None, de
     figures = judge(
         prior.network, prior.deviation_scale, judged, unseen, chosen, seed=2, device=device, learned=learned
     )
-    out.write_text(json.dumps(figures))
+    result = new_result("prior on panoramas", torch.device(device), {"panoramas": len(unseen)})
+    out.write_text(json.dumps(result | figures))
 
 
 @torch.no_grad()

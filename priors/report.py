@@ -32,10 +32,10 @@ _AREAS = {"30": "up to 30", "300": "31 to 300", "3000": "301 to 3000", "27648": 
 _TEXT = """# The prior for light above white
 
 How well the network that comes with the package estimates clipped light ([Light above white](light.md)), on photos of
-seven panoramas that no training used (`checked` in `priors/sources.toml`), at most 384 for each table. Each row
-estimates the log2 excess over white of clipped values: by nothing (*white*), by the mean of the training (*constant*),
-by a ridge regression on ten figures of the photo's histogram, and by the network. Constant and ridge are fitted on the
-panoramas of the training. RMS counts all clipped values alike. The card beside the weights,
+{panoramas} panoramas that no training used (`checked` and `checked_more` in `priors/sources.toml`), at most 384 for
+each table. Each row estimates the log2 excess over white of clipped values: by nothing (*white*), by the mean of the
+training (*constant*), by a ridge regression on ten figures of the photo's histogram, and by the network. Constant and
+ridge are fitted on the panoramas of the training. RMS counts all clipped values alike. The card beside the weights,
 `sehdr_warp/prior/clipped_light.md`, says how they were trained.
 
 {tables}
@@ -93,6 +93,7 @@ def main(figures_file: Path, brackets_file: Path, folder: Path, /) -> None:
     values |= {"brackets": _bracket_rows(brackets["rows"]), **brackets["colors"]}
     photos = [photo["stack"] for photo in brackets["photos"]]
     values |= {"photos": len(photos), "stacks": len(set(photos))}
+    values |= {"panoramas": figures["settings"]["panoramas"]}
     (folder / f"{PAGE}.md").write_text(_TEXT.format(**values))
     _plot(np.array(network["sample"]), folder / "images" / f"{PAGE}.png")
 
