@@ -15,6 +15,9 @@ from ..errors import SehdrError
 REFERENCE_ITERATIONS = 30_000  # Length of a training, as in 3DGS, that iteration numbers of a config refer to
 RESTART = 10.0
 """Rate of the positions, as a multiple of the final one, at which a finished training goes on: 3DGS's half-way."""
+LONGEST_EXTENSION = 3.0
+"""Multiple of a finished training's iterations beyond which densification begins again. With 3, 4 and 20 times 150
+steps on the embedded scene, held-out photos gain 0.35, 0.5 and 1.4 dB from it by the end."""
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, le=100.0)]
@@ -293,10 +296,11 @@ class Config(_Table):
         """Return the config for the steps that follow a training that was finished after `finished_at` iterations.
 
         The scene must not become worse before it becomes better. So Gaussians are no longer relocated or added, the SH
-        degree stays, and positions learn at most at RESTART times their final rate, falling to it.
+        degree stays, and positions learn at most at RESTART times their final rate, falling to it. But a training that
+        goes on beyond LONGEST_EXTENSION times its iterations was a trial, and this config is returned as it is.
         """
         part = finished_at / self.schedule.iterations
-        if not 0 < part < 1:
+        if not 1 / LONGEST_EXTENSION <= part < 1:
             return self
         end = int(part * REFERENCE_ITERATIONS)
         rates, densification, schedule = self.optimizer, self.densification, self.schedule

@@ -191,7 +191,8 @@ def _resumed_trainer(
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     large_scene = checkpoint.values.get("large_scene")
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
-    trainer = Trainer(scene, saved.after(finished_at), field, ranks=ranks, large_scene=large_scene)
+    longer = saved.after(finished_at)
+    trainer = Trainer(scene, longer, field, ranks=ranks, large_scene=large_scene)
     try:
         load_state(trainer, checkpoint)
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
@@ -200,7 +201,7 @@ def _resumed_trainer(
     if trainer.total > before:
         folder.extend(trainer.total, finished_at)
         text = "the schedule is stretched from %d to %d iterations: rates and densification are those of the longer one"
-        if finished_at == before:
+        if longer is not saved:
             text = (
                 "the finished training goes on from %d to %d iterations: positions learn slowly, no Gaussians are added"
             )

@@ -244,10 +244,10 @@ def test_a_planned_run_that_was_stretched_is_resumed_with_its_preset(scene, tmp_
 
 def test_a_finished_training_that_goes_on_for_much_longer_loses_nothing_first(scene, trained, tmp_path):
     """And an interruption changes no bit of it, although it is not the schedule of its config."""
-    longer, runs = override_config(VARIANTS["default"], {"schedule.iterations": 300}), []
+    longer, runs = override_config(VARIANTS["default"], {"schedule.iterations": 250}), []
     for name, stops in (("whole", ()), ("cut", (130, 170))):
         shutil.copytree(trained("default"), tmp_path / name)
-        for stop in (*stops, 300):
+        for stop in (*stops, 250):
             trainer = create_trainer(without_truth(scene), tmp_path / name, longer, device="cpu", resume=True)
             before = evaluate_views(trainer.field, scene.train_views, trainer.degree)["psnr_ldr"]
             count = trainer.field.gaussians.count
@@ -257,12 +257,22 @@ def test_a_finished_training_that_goes_on_for_much_longer_loses_nothing_first(sc
                 if step.iteration in (100, 190):
                     after = evaluate_views(trainer.field, scene.train_views, trainer.degree)["psnr_ldr"]
                     assert after > before - 0.3
-                if step.iteration == stop < 300:
+                if step.iteration == stop < 250:
                     trainer.stop()
             assert load_run(tmp_path / name).degree == 1
         runs.append(RunFolder(tmp_path / name).newest_checkpoint())
     whole, cut = runs
     assert all(torch.equal(value, cut.tensors[name]) for name, value in whole.tensors.items())
+
+
+@pytest.mark.parametrize(("total", "densifies"), [(250, False), (900, True)])
+def test_densification_begins_again_after_a_trial_alone(scene, trained, tmp_path, total, densifies):
+    shutil.copytree(trained("default"), tmp_path / "run")
+    longer = override_config(VARIANTS["default"], {"schedule.iterations": total})
+    for config in (longer, None):
+        trainer = create_trainer(without_truth(scene), tmp_path / "run", config, device="cpu", resume=True)
+        trainer.output.folder.unlock()
+        assert any(map(trainer.strategy.is_due, range(trainer.iteration + 1, total))) == densifies
 
 
 def test_a_field_that_a_damaged_plan_invents_is_named_with_the_file(scene, tmp_path):
