@@ -26,7 +26,6 @@ from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.scene.images.hdr_files import read_hdr
 from sehdr_warp.synth.expose import ladder_of
-from sehdr_warp.training.plan import PRUNE_NEAR_ANGLE
 from sehdr_warp.training.train import train
 
 from .results import finish, new_result
@@ -75,8 +74,7 @@ def main(
     scene = _scene(cameras, photos)
     settings = {"views": views, "size": size, "width": width, "samples": samples, "iterations": iterations}
     result = new_result("panorama", torch.device(device), settings)
-    # As the plan of photos has it where cameras look all around; on truth there is no plan.
-    config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": PRUNE_NEAR_ANGLE})
+    config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": 0.12})
     is_trained = (work / "run" / "summary.json").is_file()
     run = load_run(work / "run", device=device) if is_trained else train(scene, work / "run", config, device=device)
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))

@@ -33,7 +33,6 @@ CPU_FEWEST = 1000  # Iterations on a CPU, however long they take
 CPU_STEPS_PER_PHOTO, CPU_MOST_SECONDS = 10, 600.0
 """Steps on each photo, if they take no longer: with 4, the scene is blurred, and held-out photos still gain 1 dB in the
 last third."""
-PRUNE_NEAR_ANGLE = 0.12  # mcmc.prune_near_angle if cameras look all around
 CPU_CAP_DENSITY = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
 GPU_CAP_DENSITY = 240.0
 """mcmc.cap_density on a GPU if there are more than MANY_PHOTOS photos of a scene that is not large. With more,
@@ -269,11 +268,6 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> D
     if options.strategy == "mcmc":
         start = max(facts.points, start_count(config, facts.pixels))
         choice = f"mcmc, growing to at most {most} Gaussians" if start < most else "mcmc without growth"
-        if facts.around:
-            fields["mcmc.prune_near_angle"] = PRUNE_NEAR_ANGLE
-            reason += (
-                "; the cameras look all around from within, where wide Gaussians near them would cover the picture"
-            )
         return Decision(fields, choice, f"{reason}; {start} to start with")
     # Relocation has this budget by itself; densification by gradients stops nowhere.
     most = min(options.cap_max, max(most, 2 * facts.points))

@@ -27,9 +27,6 @@ MOST_VIEWS = 64  # Largest number of photos whose codes are read; cameras are re
 LOWEST_PLATEAU = 200  # Lowest code, of 255, that photos clip at below white, as after an edit
 PLATEAU_CODES = 3  # Brightest codes that occur, over which JPEG spreads the clipped pixels
 PLATEAU_SHARE, PLATEAU_EXCESS = 1e-3, 3.0  # Least part of the pixels that they hold, and multiple of the codes below
-MAX_ALIGNMENT, MOST_AHEAD = 0.3, 0.75
-"""Cameras look all around if both figures are below these. Eight captures of objects, rooms and grounds have 0.5 to 1
-of the first, maps from within a place 0.1; objects have nearly 1 of the second."""
 
 
 @dataclass(frozen=True)
@@ -49,18 +46,11 @@ class SceneFacts:
     contrast: float  # Standard deviation of all encoded values
     # Approximate stops between the darkest and the brightest photo's median if no exposure times are known; else 0
     drift: float
-    view_alignment: float = 1.0  # Length of the mean viewing direction: 1 if all cameras look the same way
-    inward_fraction: float = 1.0  # Fraction of the cameras that look towards the middle of all
     light_known: bool = False  # Whether the photos hold light itself: RAW, linear, float
     unclipped: bool = False  # Whether they are float pictures without clipping
     plateau: int = 0  # Code of 255, below 255, at which the photos clip, as after an edit; 0 if they do not
     pixel_bytes: int = 3  # Bytes of a pixel of the photos on a device, with its mask
     clipped_when_dark: float = 0.0  # As `clipped`, of the photos with the shortest exposures, three or more
-
-    @property
-    def around(self) -> bool:
-        """True if cameras look all around from within, as in a room, and not at an object from its sides."""
-        return self.view_alignment < MAX_ALIGNMENT and self.inward_fraction < MOST_AHEAD
 
 
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
@@ -73,7 +63,6 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     longest = 2 * sorted(view.exposure_time for view in photos)[:3][-1]
     dark_views = every_nth([view for view in views if view.exposure_time <= longest], MOST_VIEWS)
-    view_alignment, inward_fraction = _viewing_directions(np.stack([view.camera.world_to_camera for view in views]))
     return SceneFacts(
         photos=len(photos),
         pixels=sum(view.camera.width * view.camera.height for view in photos),
@@ -86,8 +75,6 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         black=black,
         contrast=float(np.sqrt(max(square - mean**2, 0.0))),
         drift=0.0 if scene.exposure_times_known else float(np.ptp(figures[:, -1])),
-        view_alignment=view_alignment,
-        inward_fraction=inward_fraction,
         light_known=scene.light_known,
         unclipped=scene.light_known and all(view.source and file_kind(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
@@ -147,14 +134,6 @@ def _plateau(views: Sequence[View]) -> int:
     at, below = (counts[max(0, top - PLATEAU_CODES) : top].sum() for top in (largest + 1, largest + 1 - PLATEAU_CODES))
     is_plateau = at >= PLATEAU_SHARE * counts.sum() and at >= PLATEAU_EXCESS * below
     return largest if is_plateau and LOWEST_PLATEAU <= largest < 255 else 0
-
-
-def _viewing_directions(poses: np.ndarray) -> tuple[float, float]:
-    """Return SceneFacts.view_alignment and .inward_fraction of cameras [V, 4, 4]."""
-    forward = poses[:, 2, :3]
-    positions = -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
-    inwards = np.einsum("vi,vi->v", positions.mean(axis=0) - positions, forward)
-    return float(np.linalg.norm(forward.mean(axis=0))), float((inwards > 0).mean())
 
 
 def largest_hdr_truth(scene: Scene, loss: LossConfig) -> float:

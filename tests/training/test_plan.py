@@ -12,9 +12,8 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.runs.config import ScheduleConfig
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.scene import Camera, codes_of, look_at
+from sehdr_warp.scene import Camera, codes_of
 from sehdr_warp.training.plan import (
-    PRUNE_NEAR_ANGLE,
     RULES,
     SCALED_RATES,
     Decision,
@@ -56,30 +55,6 @@ def test_facts_are_those_of_the_scene(scene, facts):
     assert facts.overlap > 0.5 and facts.visibility > 4
     clipped = [(view.image >= 254.5 / 255).any(2).mean() for view in scene.train_views]
     assert facts.clipped == pytest.approx(float(np.mean(clipped)))
-
-
-@pytest.mark.parametrize(
-    "turned, aside, around",
-    [(180, 0.0, True), (180, 0.5, True), (40, 0.0, False), (0, 0.0, False)],
-    ids=["from within", "from within, apart", "part of a room", "at a thing"],
-)
-def test_wide_gaussians_move_where_cameras_look_all_around(scene, turned, aside, around):
-    """Cameras on a circle that look out, spread over `turned` degrees to either side; 0: in, as the scene's do."""
-    views = scene.views
-    if turned:
-        random = np.random.default_rng(0)
-        angles = np.radians(np.linspace(-turned, turned, len(views), endpoint=False))
-        out = np.stack([np.sin(angles), np.cos(angles), 0 * angles], 1)
-        places = aside * random.normal(size=(len(views), 3))
-        posed = zip(views, places, out, strict=True)
-        views = tuple(
-            replace(view, camera=replace(view.camera, fx=8.0, world_to_camera=look_at(place, place + direction)))
-            for view, place, direction in posed
-        )
-    plan = make_plan(replace(scene, views=views, points=scene.points * 0), config_of())
-    assert plan.facts.around == around
-    assert plan.config.mcmc.prune_near_angle == (PRUNE_NEAR_ANGLE if around else 0)
-    assert ("all around" in plan.table()) == around
 
 
 def test_a_plan_decides_everything_once_with_figures(scene):
