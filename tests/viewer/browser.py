@@ -12,7 +12,9 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 # Software rendering, so that a test needs no GPU; Chromium as root has no sandbox.
 ARGUMENTS = ["--enable-unsafe-swiftshader", *["--no-sandbox"] * (os.geteuid() == 0)]
 
-HARMLESS = ("gpu stall", "swiftshader")  # What the driver of a software GPU says of its speed
+# What Chromium says of a software GPU: its speed, and that it lost a context, after which pages draw again, as the
+# tests see.
+HARMLESS = ("gpu stall", "swiftshader", "losecontext: context lost")
 
 
 @contextmanager
@@ -48,7 +50,7 @@ def page_of(chromium_browser, url, width=700, height=420, script="", **options):
     page.goto(url)
     yield page
     left = [line for line in complaints if not any(words in line.lower() for words in HARMLESS)]
-    context.close()  # A page that is closed may complain of its lost WebGL context.
+    context.close()
     assert not left, f"the page complained: {left}"
 
 
