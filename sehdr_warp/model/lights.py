@@ -24,7 +24,8 @@ REACH = 3.0  # Gaussians join one light if they are nearer than this many median
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras, if nothing hides the light from there
 MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
-EXPECTED_CLIPPED = 0.9  # Of the share that clips if the scene is right, from which the darkest photo's white is certain
+EXPECTED_CLIPPED = 0.9  # Of the share that clips if the scene is right, from which the darkest photos' white is certain
+DARKEST_CLIPPED = 0.5  # Of the share that the darkest photos show, which clips there too
 UNOBSTRUCTED = 0.5  # Of what most views show of a light: those that show less count as obstructed
 MOST_LIGHTS, MOST_VIEWS = 64, 24  # MOST_VIEWS of the longest exposures, and of those of half of these or less
 LEAST_ROWS, MOST_ROWS = 128, 724
@@ -325,8 +326,11 @@ def _certain_radiance(group: _Candidates, photos: _Photos) -> np.ndarray:
     clips = (group.angles > 0)[..., None] & (radiance > photos.whites[:, None, None])
     expected = (clips.mean(2) * group.angles).sum(0) / np.maximum(angles, 1e-30)
     darkest = np.where(clips, photos.whites[:, None, None], 0.0).max(0)
-    # If fewer values clip, the scene is brighter than some photos.
-    sure = np.where((group.clipped >= EXPECTED_CLIPPED * expected)[:, None], darkest, 0.0)
+    dark = (clips & (photos.whites[:, None, None] >= darkest)) * group.angles[..., None]
+    of_darkest = dark.sum(0) / np.maximum(angles, 1e-30)[:, None]
+    # If fewer values clip, the scene is brighter than some photos, which may be the darkest ones alone.
+    missing = np.minimum((1 - EXPECTED_CLIPPED) * expected[:, None], (1 - DARKEST_CLIPPED) * of_darkest)
+    sure = np.where((expected - group.clipped)[:, None] <= missing, darkest, 0.0)
     bound = np.minimum(np.maximum(sure, photos.white), radiance)
     return np.average(bound, axis=0, weights=np.maximum(angles, 1e-30))
 

@@ -257,6 +257,16 @@ def test_a_darker_photo_that_clips_raises_the_lower_bound(darker, bound):
     assert light.lower_bound == pytest.approx((1, 1, 1), rel=0.05)
 
 
+def test_one_dark_photo_of_many_raises_the_lower_bound_only_if_it_clips():
+    shots = [(camera, 1.0) for camera, _ in 2 * small_views()]
+    shots[0] = (shots[0][0], 1 / 16)
+    scene, truth = (field(panel(), (radiance,) * 3, 0.03) for radiance in (24, 9.6))
+    (measured,) = find_lights(scene, photograph(scene, shots), shots)
+    assert measured.lower_bound.min() > 10
+    (light,) = find_lights(scene, photograph(scene, shots, truth), shots)
+    assert light.lower_bound.max() < 9.6
+
+
 def test_errors_of_unclipped_values_count_if_these_measure_a_light():
     """The scene has a quarter of the light that six dark photos show. Six others clip it."""
     scene, truth = field(panel(), RADIANCE / 8, 0.03), field(panel(), RADIANCE / 2, 0.03)
