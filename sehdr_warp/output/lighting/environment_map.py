@@ -38,7 +38,7 @@ _WHOLE = 99.5  # Covered per cent from which nothing is said of the rest
 _FINEST = {"latlong": 4096, "cube": 1024}  # Smaller maps are averaged from renders of at most so many pixels across
 _MOST_PIXELS = 1 << 21  # Pixels that are rendered at once
 _COARSE, _DARKEST = 128, 1e-9  # Inpainting: columns of the coarse map, and the least light
-_SURROUNDINGS, _MOST_OVER = 0.1, 8.0  # Inpainting: radians, and the most times the mean around that counts
+_SURROUNDINGS, _MOST_OVER = 0.1, 32.0  # Inpainting: radians, and the most times the mean around that counts
 # The nearest axes of a cube's faces in OpenEXR's order (+X -X +Y -Y +Z -Z): to the right, down, and out.
 _FACES = np.array(
     [
