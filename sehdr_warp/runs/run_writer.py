@@ -183,10 +183,11 @@ class RunWriter(RunFolder):
             _refuse_foreign(folder)
         with writing(self.path):
             if new.is_dir():
-                results = self.summary_file, self.metrics, self.confidence, self.plan_file
-                settings = self.extension, self.orientation, self.light_unit
-                events = self.tensorboard.glob("events.out.tfevents.*")  # TensorBoard would mix their curves.
-                for file in (*results, *settings, *events, self.scene_file, self.info_file, self.config_file):
+                files = [self.summary_file, self.metrics, self.confidence, self.plan_file]
+                files += [self.extension, self.orientation, self.light_unit]
+                files += self.tensorboard.glob("events.out.tfevents.*")  # TensorBoard would mix their curves.
+                files += [self.scene_file, self.info_file, self.config_file]
+                for file in files:
                     file.unlink(missing_ok=True)
                 for checkpoint in self._checkpoint_folders():
                     remove_checkpoint(checkpoint)

@@ -325,9 +325,10 @@ def fit_gains(
     from scipy import sparse
     from scipy.sparse.linalg import lsmr
 
-    names = [view.name for view in (*views, *others)]
-    light, radius = point_light((*views, *others), points, visible, response)
-    lenses, view_count, point_count = _measured_lenses((*views, *others), light, radius), len(views), len(points)
+    every, view_count, point_count = [*views, *others], len(views), len(points)
+    names = [view.name for view in every]
+    light, radius = point_light(every, points, visible, response)
+    lenses = _measured_lenses(every, light, radius)
     view, point, channel = np.nonzero(np.isfinite(light[:view_count]))
     values, lens = light[view, point, channel], lenses[view]
     r = np.where(lens >= 0, radius[view, point], 0.0)
@@ -336,18 +337,16 @@ def fit_gains(
     first_lens = 3 * (point_count + view_count)
     a = first_lens + 2 * lens.clip(0)
     columns = np.concatenate([3 * point + channel, 3 * (point_count + view) + channel, a, a + 1])
-    system = sparse.csr_matrix(
-        (np.concatenate([one, one, -(r**2), -(r**4)]), (np.tile(rows, 4), columns)),
-        shape=(len(rows), first_lens + 2 * (lenses.max() + 2)),
-    )
-    solution: np.ndarray = np.zeros(first_lens + 2 * (lenses.max() + 2))
+    factors, shape = np.concatenate([one, one, -(r**2), -(r**4)]), (len(rows), first_lens + 2 * (lenses.max() + 2))
+    system = sparse.csr_matrix((factors, (np.tile(rows, 4), columns)), shape=shape)
+    solution: np.ndarray = np.zeros(shape[1])
     for width in TIGHT:
         residual = (values - system @ solution) / width if solution.any() else np.zeros_like(values)
         weight = 1 / (1 + residual**2)
         solution = lsmr(sparse.diags(weight) @ system, weight * values, damp=1e-3, x0=solution, maxiter=80)[0]
     pairs = [*map(_possible, solution[first_lens:].reshape(-1, 2)[: lenses.max() + 1]), NO_VIGNETTING]
     vignetting = {name: pairs[lens] for name, lens in zip(names, lenses, strict=True)}
-    powers = _powers(ExposureCompensation({}, vignetting), (*views, *others), radius)
+    powers = _powers(ExposureCompensation({}, vignetting), every, radius)
     surfaces = solution[: 3 * point_count].reshape(point_count, 3)
     gains = list(solution[3 * point_count : first_lens].reshape(view_count, 3))
     mean = np.mean(gains, 0)

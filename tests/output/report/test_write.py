@@ -95,11 +95,11 @@ def test_the_truth_has_the_scale_of_the_scene(tmp_path, monkeypatch):
     """Photos without exposure times tell radiance up to a factor."""
     run, scene = make(tmp_path)
     scene = replace(scene, views=tuple(replace(view, hdr=3 * view.hdr) for view in scene.views))
-    drawn = []
-    monkeypatch.setattr(write, "stops_figure", lambda comparison: drawn.append(comparison) or stops_figure(comparison))
+    items = []
+    monkeypatch.setattr(write, "stops_figure", lambda item: items.append(item) or stops_figure(item))
     monkeypatch.setattr(write, "report_page", lambda *_, **__: "")
     write_report(run, scene, tmp_path / "report", evaluation={"protocol": {"aligned": {"scale": 3.0}}})
-    np.testing.assert_allclose(drawn[0].truth, drawn[0].hdr, rtol=1e-3)
+    np.testing.assert_allclose(items[0].truth, items[0].hdr, rtol=1e-3)
 
 
 def test_each_photo_is_re_exposed_from_its_own_exposure(tmp_path):
