@@ -139,7 +139,7 @@ def plain_size(path: Path) -> int:
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
-    """Return the whole file; raise InputError if it is missing, unreadable, empty or larger than `limit` bytes."""
+    """Return the whole file; raise InputError if it is missing, unreadable, empty, a pointer or above `limit` bytes."""
     try:
         if (size := plain_size(path)) > limit:
             problem = f"{size} bytes is more than the limit of {limit}"
@@ -151,6 +151,8 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
         raise UnreadableError(path, error) from None
     if not data:
         raise InputError(path, "file is empty", "copy or export the file again")
+    if data.startswith(b"version https://git-lfs"):
+        raise InputError(path, "is a Git LFS pointer, not the file itself", "fetch it with `git lfs pull`")
     return data
 
 
@@ -168,8 +170,8 @@ def read_lines(path: Path, errors: str = "strict") -> Iterator[str]:
     errors: "strict", or "surrogateescape" to keep bytes that are not UTF-8, as Python keeps them in names of files.
     """
     try:
-        if plain_size(path) == 0:
-            read_bytes(path)  # It refuses an empty one.
+        if plain_size(path) < 1024:
+            read_bytes(path)  # It refuses an empty one, and a pointer.
         with open(path, encoding="utf-8-sig", errors=errors) as file:
             while line := file.readline(_MAX_LINE):
                 if len(line) == _MAX_LINE:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..files import atomic_path, plain_size
+from ..files import atomic_path, plain_size, read_bytes
 from ..limits import available_memory
 from ..subsets import first_names
 from .arrays import HARMONIC_0, GaussianArrays, degree_of, read_facts
@@ -180,7 +180,8 @@ def _check_header(path: Path) -> None:
 
 def _start(path: Path) -> bytes:
     try:
-        plain_size(path)
+        if plain_size(path) < 1024:
+            read_bytes(path)  # It refuses a pointer.
         with path.open("rb") as file:
             return file.read(_MOST_HEADER)
     except FileNotFoundError:

@@ -132,6 +132,20 @@ def test_fewer_pictures_of_results_lie_beside_the_photos(tmp_path):
     assert any(note.startswith(f"5 photos of images {others} input: ") for note in find_photos(tmp_path).notes)
 
 
+def test_depth_and_confidence_beside_photos_are_not_photos(tmp_path):
+    """As the 3D Scanner App writes all data; a photo may have such a word in its name."""
+    photos(tmp_path)
+    Image.fromarray(pattern(16, 12, 9)).save(tmp_path / "depth_of_field.jpg")
+    for i in range(9):
+        Image.fromarray(pattern(8, 6, i)[..., 0].astype(np.uint16) << 4).save(tmp_path / f"depth_{i}.png")
+        Image.fromarray(pattern(8, 6, i)[..., 0]).save(tmp_path / f"frame-{i}.confidence.png")
+    dataset = find_photos(tmp_path)
+    assert [record.view for record in dataset.records] == [*(f"IMG_{i}" for i in range(4)), "depth_of_field"]
+    note = "18 pictures that are grey and called depth or confidence are left out: depth_0.png, depth_1.png,"
+    assert any(each.startswith(note) for each in dataset.notes)
+    assert unused_notes(tmp_path, dataset.records, dataset.mentioned) == []
+
+
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
     ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"), ("frame_00000.json", "3D Scanner App"),
