@@ -14,10 +14,12 @@ from ..file_names import (
     find_image,
     find_images,
     image_folder,
+    list_images,
     natural_key,
     photo_and_truth,
     renamed_note,
 )
+from ..images.ldr_files import PHOTO_SUFFIXES
 from ..photos import unusable_notes
 from ..unused_files import unread_kinds
 from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model
@@ -37,14 +39,19 @@ def model_fits(folder: Path, model: Path) -> bool:
 
 
 def _folder_of(names: Sequence[str], folder: Path) -> Path | None:
-    """Return the folder of a set, or one directly in it, that holds a photo under one of the exact names."""
+    """Return the folder of a set, or one directly in it, that holds photos under the exact names.
+
+    Numbers such as 1.jpg may be names of several captures: the folder with most of the names and fewest others counts.
+    """
     places = [
         folder,
         *sorted(place for place in folder.iterdir() if place.is_dir() and place.name not in OTHER_FOLDERS),
     ]
     inner = [name.replace("\\", "/") for name in names]
-    files = ((place, name) for place in places for name in inner if not PurePosixPath(name).is_absolute())
-    return next((place for place, name in files if ".." not in name and (place / name).is_file()), None)
+    inner = [name for name in inner if not PurePosixPath(name).is_absolute() and ".." not in name]
+    present = [sum((place / name).is_file() for name in inner) for place in places]
+    fitting = [place for place, count in zip(places, present, strict=True) if count == max(present) > 0]
+    return min(fitting, key=lambda place: len(list_images(place, PHOTO_SUFFIXES)), default=None)
 
 
 def read_colmap(folder: Path, source: Path | None = None) -> DataparserOutputs:

@@ -72,6 +72,17 @@ def test_models_and_photos_are_found_in_other_folders_by_the_names_of_the_photos
     assert scene.format == "colmap" and len(scene.views) == 6
 
 
+def test_of_folders_with_the_names_of_a_model_the_one_with_fewest_others_counts(tmp_path):
+    """Photos of several captures are all called 1.jpg, 2.jpg ..."""
+    write_colmap(tmp_path, name="{:03d}.png")
+    (tmp_path / "images").rename(tmp_path / "scene")
+    for i in range(9):
+        for folder in ("another", "yet_another")[: 2 if i else 1]:
+            (tmp_path / folder).mkdir(exist_ok=True)
+            Image.fromarray(pattern(64, 48, 20 + i)).save(tmp_path / folder / f"{i:03d}.png")
+    assert {record.image.parent.name for record in read_colmap(tmp_path).records} == {"scene"}
+
+
 def test_a_model_that_names_none_of_the_photos_is_not_used_and_named(tmp_path):
     write_colmap(tmp_path / "old")
     (tmp_path / "old" / "images").rename(tmp_path / "elsewhere")
