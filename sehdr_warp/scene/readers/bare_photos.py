@@ -39,17 +39,18 @@ _NO_PHOTOS = (*OTHER_FOLDERS, "depth", "depths", "confidence", "normals", "thumb
 # Files and folders by which a program states cameras, in lower case.
 _POSE_FILES = {
     "cameras.xml": "Metashape", "bundle.out": "Bundler", "bundle.rd.out": "Bundler", "sfm_data.json": "OpenMVG",
-    "cameras.sfm": "Meshroom", "model.nvm": "VisualSFM", "registration.csv": "RealityCapture",
-    "mesh_info.json": "Polycam", "metadata.json": "Record3D", "arposes.txt": "ARKit", "cams": "MVSNet",
-    "cameras_sphere.npz": "NeuS", "cameras.npz": "IDR", "pose": "NSVF", "camera": "Nerfies", "dslr": "ScanNet++",
-    "groundtruth.txt": "TUM", "traj.txt": "Replica", "images.lst": "RealityScan",
-    "_par.txt": "Middlebury",
+    "cameras.sfm": "Meshroom", "registration.csv": "RealityCapture", "mesh_info.json": "Polycam",
+    "metadata.json": "Record3D", "arposes.txt": "ARKit", "cams": "MVSNet", "cameras_sphere.npz": "NeuS",
+    "cameras.npz": "IDR", "pose": "NSVF", "camera": "Nerfies", "dslr": "ScanNet++", "groundtruth.txt": "TUM",
+    "traj.txt": "Replica", "images.lst": "RealityScan", "_par.txt": "Middlebury",
 }  # fmt: skip
-# By suffix what files of any name hold that state cameras.
-_POSE_CONTENT = {
-    ".xml": (b"<chunk", "Metashape"), ".csv": (b"#name,x,y", "RealityScan"), ".xmp": (b"xcr:", "RealityScan"),
-    ".out": (b"Bundle file", "Bundler"), ".json": (b'"cameraPoseARFrame"', "3D Scanner App"),
-}  # fmt: skip
+# What files of any name hold that state cameras.
+_POSE_CONTENT = (
+    (".csv", b"#name,x,y", "RealityScan"), (".json", b'"cameraPoseARFrame"', "3D Scanner App"),
+    (".json", b'"intrinsicId"', "Meshroom"), (".json", b'"sfm_data_version"', "OpenMVG"),
+    (".nvm", b"NVM_V3", "VisualSFM"), (".out", b"Bundle file", "Bundler"), (".sfm", b'"intrinsicId"', "Meshroom"),
+    (".xml", b"<chunk", "Metashape"), (".xmp", b"xcr:", "RealityScan"),
+)  # fmt: skip
 _MEDIA = frozenset().union(VIDEO_SUFFIXES, UNSTITCHED_SUFFIXES, HEIF_SUFFIXES)  # May be meant beside a folder of photos
 _CAMERA_FOLDER = re.compile(r"\d{6}_[a-z_]|\d{3}([a-z0-9_]{5})")  # 202410__ of an iPhone, and 100CANON
 _MAP = re.compile(r"(^|[^a-z])(depths?|conf|confidence|disparity)($|[^a-z])")  # conf_00001 of the 3D Scanner App
@@ -327,10 +328,10 @@ def _cameras_above(folder: Path) -> list[str]:
 
 def _foreign_poses(folder: Path) -> list[str]:
     """Return a note on poses of other programs beside bare photos: they are not read, and cameras are found anew."""
-    entries = sorted(folder.iterdir())
+    entries = sorted([*folder.iterdir(), *folder.glob("bundle/*.out")])
     names = ((file.name, _MIDDLEBURY.sub("_par.txt", file.name.lower())) for file in entries)
     tools = [f"{tool} ({name})" for name, key in names if (tool := _POSE_FILES.get(key))]
-    for suffix, (mark, tool) in sorted(_POSE_CONTENT.items()):
+    for suffix, mark, tool in _POSE_CONTENT:
         files = (file for file in entries if file.suffix.lower() == suffix and file.name.lower() not in _POSE_FILES)
         file = next((file for file in itertools.islice(files, _MOST_READ) if _has_near_its_start(file, mark)), None)
         tools += [f"{tool} ({file.name})"] if file is not None else []

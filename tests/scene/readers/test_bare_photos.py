@@ -159,6 +159,18 @@ def test_poses_of_other_programs_are_named(tmp_path, file, tool):
     assert any(f"poses of {tool} ({file}) are not read" in note for note in find_photos(tmp_path).notes)
 
 
+@pytest.mark.parametrize("file, content, tool", [
+    ("sfm.json", '{"views": [{"intrinsicId": "1"}]}', "Meshroom"), ("a.json", '{"sfm_data_version": 1}', "OpenMVG"),
+    ("dense.nvm", "NVM_V3", "VisualSFM"), ("bundle/bundle.out", "# Bundle file v0.3", "Bundler"),
+])  # fmt: skip
+def test_poses_of_other_programs_are_known_by_their_content(tmp_path, file, content, tool):
+    photos(tmp_path)
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text(content)
+    name = Path(file).name
+    assert any(note.startswith(f"poses of {tool} ({name}) are not read") for note in find_photos(tmp_path).notes)
+
+
 def test_a_photo_whose_camera_is_uncertain_is_not_held_out(tmp_path, monkeypatch):
     photos(tmp_path, 9)
     lens = Lens("PINHOLE", 16, 12, (14.0, 14.0, 8.0, 6.0), Path("cameras.bin"))
