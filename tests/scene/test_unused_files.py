@@ -30,6 +30,12 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     assert said(scene, "not read") == [
         "not used, as files of kinds that are not read: 1 MOV (film.mov), 2 XYZ (clip2.xyz ...)"
     ]
+    for i in range(9):  # More than in the model, which was not found for all
+        Image.fromarray(pattern(64, 48)).save(tmp_path / "images" / f"c{i}.png")
+    remedy = f"; to find cameras of all photos anew, give {tmp_path / 'images'}"
+    assert said(load(tmp_path), "in no view") == [
+        "11 photos of images are in no view: a.png, b.jpg, c0.png ..." + remedy
+    ]
     write_colmap(tmp_path / "folders", name="left/{:03d}.png")
     shutil.copytree(tmp_path / "folders/images/left", tmp_path / "folders/images/right")
     assert said(load(tmp_path / "folders"), "in no view")[0].startswith(
