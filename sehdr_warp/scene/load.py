@@ -20,6 +20,7 @@ from .masks import assign_masks
 from .photos import usable_photos
 from .pose_conventions import POSED, with_fitting_cameras
 from .preprocess import preprocess
+from .readers.arkit import find_scan, read_scan
 from .readers.bare_photos import find_photos, inner_folder, place_photos, with_cameras
 from .readers.colmap import model_fits, read_colmap
 from .readers.colmap_model import find_model, has_images
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 _MARK = "transforms_train.json"  # A file of every embedded scene
 _HOLDOUT = 8  # Every eighth view is held out, as LLFF, Mip-NeRF 360 and 3DGS do
-_WITH_TRUTH = ("colmap", "transforms", "opensfm", "llff", "photos")  # Layouts that do not say where truth lies
+_WITH_TRUTH = ("colmap", "transforms", "opensfm", "arkit", "llff", "photos")  # Layouts that do not say where truth lies
 _FEWEST_FOR_TEST = 5  # In smaller sets no view is held out
 
 
@@ -232,6 +233,7 @@ def _read(folder: Path) -> DataparserOutputs:
         (posed is not None and model_fits(folder, posed), partial(read_colmap, source=model)),
         (find_reconstruction(folder) is not None, read_opensfm),
         (has("poses_bounds.npy"), read_llff),
+        (find_scan(folder) is not None, read_scan),
         (model != posed, partial(read_colmap, source=model)),  # Refused: nothing else has poses.
     )
     reader = next((reader for fits, reader in readers if fits), None)

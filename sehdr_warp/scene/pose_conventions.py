@@ -20,7 +20,7 @@ from .dataparser import ImageRecord
 from .lens import Lens
 from .shared_pixels import SharedPixels, candidate_pairs, shared_pixels
 
-POSED = ("transforms", "colmap", "llff", "opensfm")
+POSED = ("transforms", "colmap", "llff", "opensfm", "arkit")
 """Layouts whose cameras are checked."""
 MISFIT = "does not fit the photos, by no convention"
 """Words of the note on cameras that no reading mends."""
@@ -31,7 +31,8 @@ _AXES = {  # From a camera's axes to OpenCV's: x right, y down, z ahead
     "LLFF's": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
     "upside-down": np.diag([-1.0, -1.0, 1.0]),
 }
-_FILE_AXES = {"transforms": "OpenGL's", "llff": "LLFF's"}  # In which camera-to-world is stated; others: world-to-camera
+# In which axes camera-to-world is stated; other layouts state world-to-camera.
+_FILE_AXES = {"transforms": "OpenGL's", "arkit": "OpenGL's", "llff": "LLFF's"}
 _SURE_PAIRS, _FEWEST_PAIRS, _MOST_PAIRS = 3, 4, 8  # That show cameras to be right, and wrong; that are compared
 _FITS, _MISSES = 1.2, 4.0  # Pixels of a photo of shared_pixels.SIDE: sound cameras have 0.1 to 0.6, other axes 3 to 100
 _EXACT = 0.6  # Pixels from which on the lens is doubted: a focal length that is 10 % off has 0.4 to 2.5

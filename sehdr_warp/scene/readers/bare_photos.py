@@ -19,7 +19,7 @@ from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto
 from ..exposure.stack import refuse_stack
 from ..file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
 from ..images.heif import HEIF_SUFFIXES, register_heif
-from ..images.ldr_files import LDR_SUFFIXES, PHOTO_SUFFIXES, PILLOW_ERRORS, open_image
+from ..images.ldr_files import PHOTO_SUFFIXES
 from ..photo_names import fold_name, photo_labels
 from ..photos import FEWEST_PHOTOS
 from ..raw.decode import color_matrix
@@ -29,7 +29,7 @@ from ..unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from ..video.decode import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
 from .colmap import INPUT
 from .colmap_model import find_model
-from .photo_copies import copies_note, find_copies
+from .photo_copies import copies_note, find_copies, is_depth_map, maps_note
 from .transforms import is_transforms
 
 _log = logging.getLogger("sehdr_warp.scene")
@@ -53,7 +53,6 @@ _POSE_CONTENT = (
 )  # fmt: skip
 _MEDIA = frozenset().union(VIDEO_SUFFIXES, UNSTITCHED_SUFFIXES, HEIF_SUFFIXES)  # May be meant beside a folder of photos
 _CAMERA_FOLDER = re.compile(r"\d{6}_[a-z_]|\d{3}([a-z0-9_]{5})")  # 202410__ of an iPhone, and 100CANON
-_MAP = re.compile(r"(^|[^a-z])(depths?|conf|confidence|disparity)($|[^a-z])")  # conf_00001 of the 3D Scanner App
 _ALIKE = 5.0  # Degrees; 1.8 between sets of 9 photos of which one has 49 points, 8 and more if people or objects move
 _MIDDLEBURY = re.compile(r".*_par\.txt")  # templeR_par.txt
 _MOST_READ = 20  # Files of one suffix whose content is looked at
@@ -68,7 +67,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
     """
     places = (place for place in (folder, folder / "images", folder / INPUT) if place.is_dir())
     listed = [list_images(place, PHOTO_SUFFIXES) for place in places]
-    maps = {picture for pictures in listed for picture in pictures if _is_map(picture)}
+    maps = {picture for pictures in listed for picture in pictures if is_depth_map(picture)}
     candidates = [[picture for picture in pictures if picture not in maps] for pictures in listed]
     photos = max(candidates, key=len)  # Fewer pictures beside `images/` are a cover, or pictures of results.
     together = _folders_of_a_camera(folder) if not photos else []
@@ -85,10 +84,8 @@ def find_photos(folder: Path) -> DataparserOutputs:
     photos = [photo for photo in photos if photo not in copies]
     _require_photos(photos, folder, len(copies))
     notes = [*copies_note(copies), *_foreign_poses(folder), *_cameras_above(folder)]
-    if maps := {picture for picture in maps if picture.parent == photos[0].parent}:
-        names = first_names(sorted(each.name for each in maps))
-        count = counted(len(maps), "picture that is grey and called {} is", "pictures that are grey and called {} are")
-        notes.append(f"{count.format('depth or confidence')} left out: {names}")
+    maps = sorted(picture for picture in maps if picture.parent == photos[0].parent)
+    notes += maps_note(maps)
     if together:
         counts = Counter(photo.parent for photo in photos)
         taken = ", ".join(f"{place} ({counts[folder / place]})" for place in together)
@@ -111,17 +108,6 @@ def find_photos(folder: Path) -> DataparserOutputs:
     records = (ImageRecord(view, photo, UNPLACED, np.eye(4), oriented=True) for view, photo in pairs)
     names = tuple(photo.name for photo in (*copies, *maps))
     return DataparserOutputs("photos", tuple(records), notes=tuple(notes), mentioned=names)
-
-
-def _is_map(picture: Path) -> bool:
-    """Return whether a picture is called depth or confidence, as apps of phones write it beside photos, and is grey."""
-    if not _MAP.search(picture.stem.lower()) or picture.suffix.lower() not in LDR_SUFFIXES:
-        return False
-    try:
-        with open_image(picture) as image:
-            return len(image.getbands()) == 1 and image.mode != "P"
-    except (InputError, *PILLOW_ERRORS):
-        return False
 
 
 def inner_folder(folder: Path) -> Path | None:

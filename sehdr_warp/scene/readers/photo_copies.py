@@ -1,4 +1,4 @@
-"""Photos that are stored twice: as another kind of file (a phone's HEIC beside its JPEG), edited, or as a copy."""
+"""Pictures beside photos: a photo as another kind of file (HEIC beside JPEG), edited or copied; and depth maps."""
 
 import re
 from collections import Counter
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
-from ...subsets import counted
+from ...subsets import counted, first_names
 from ..cached_folder import file_digest
 from ..images.downsampling import area_average
 from ..images.heif import HEIF_SUFFIXES
@@ -17,6 +17,7 @@ from ..images.ldr_files import JPEG_SUFFIXES, LDR_SUFFIXES, PILLOW_ERRORS, open_
 _ALIKE = 0.97  # Correlation of two thumbnails of one picture; photos from two places have less
 _SIDE = 32  # Of a thumbnail
 _EDITED = re.compile(r"(?<=^img_)e(?=\d)|-edited$")  # What iOS and Google Photos put into the names of edited photos
+_MAP = re.compile(r"(^|[^a-z])(depths?|conf|confidence|disparity)($|[^a-z])")  # conf_00001 of the 3D Scanner App
 _KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", *JPEG_SUFFIXES, ".bmp")
 """Kinds of files by preference: of two files of one picture the first kind counts, which may hold more bits."""
 
@@ -50,6 +51,25 @@ def copies_note(copies: Mapping[Path, Path]) -> list[str]:
     count = counted(len(copies), "photo is a copy", "photos are copies")
     more = " ..." if len(copies) > 1 else ""
     return [f"{count} of others and left out: {copy.name} of {photo.name}{more}"]
+
+
+def is_depth_map(picture: Path) -> bool:
+    """Return whether a picture is called depth or confidence, as apps of phones write it beside photos, and is grey."""
+    if not _MAP.search(picture.stem.lower()) or picture.suffix.lower() not in LDR_SUFFIXES:
+        return False
+    try:
+        with open_image(picture) as image:
+            return len(image.getbands()) == 1 and image.mode != "P"
+    except (InputError, *PILLOW_ERRORS):
+        return False
+
+
+def maps_note(maps: Sequence[Path]) -> list[str]:
+    """Return a note on depth maps that are left out; none if there are none."""
+    if not maps:
+        return []
+    count = counted(len(maps), "picture that is grey and called {} is", "pictures that are grey and called {} are")
+    return [f"{count.format('depth or confidence')} left out: {first_names([each.name for each in maps])}"]
 
 
 def _equal_files(photos: Sequence[Path]) -> tuple[dict[Path, Path], list[Path]]:

@@ -1,0 +1,87 @@
+"""Reader of scans by apps of phones: a JSON file with ARKit's pose and lens for each photo.
+
+3D Scanner App writes frame_00001.json beside frame_00001.jpg; Polycam's raw data has keyframes/cameras/1.json for
+keyframes/images/1.jpg, and corrected_cameras/ and corrected_images/ after its own optimization.
+"""
+
+import itertools
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import InputError
+from ...files import read_json
+from ..dataparser import DataparserOutputs, ImageRecord
+from ..file_names import find_image, list_images
+from ..images.ldr_files import LDR_SUFFIXES
+from ..lens import Lens
+from ..photos import photo_sizes, unusable_notes
+from .photo_copies import is_depth_map, maps_note
+from .transforms import absent_note, pose_from_opengl
+
+_PLACES = tuple(
+    (f"{above}{kind}images", f"{above}{kind}cameras") for above in ("keyframes/", "") for kind in ("corrected_", "")
+)
+_POLYCAM = [f"t_{row}{column}" for row in range(3) for column in range(4)]
+_MARKS = (b'"cameraPoseARFrame"', b'"t_00"')
+_MOST_READ = 20  # Files whose content is looked at
+_REMEDY = "export the scan again"
+
+
+def find_scan(folder: Path) -> tuple[Path, Path] | None:
+    """Return the folders of photos and of their poses, None if no photo has a file with a pose."""
+    for images, cameras in (*_PLACES, (".", ".")):
+        photos, poses = folder / images, folder / cameras
+        if photos.is_dir() and poses.is_dir():
+            files = itertools.islice(sorted(poses.glob("*.json")), _MOST_READ)
+            if any(_states_pose(file) and find_image(photos, f"{file.stem}.jpg", file) for file in files):
+                return photos, poses
+    return None
+
+
+def read_scan(folder: Path) -> DataparserOutputs:
+    """Parse a scan: a record for each photo that has a pose. Poses are camera-to-world in OpenGL's axes."""
+    places = find_scan(folder)
+    assert places is not None
+    photos, poses = places
+    records, absent, unusable = [], [], []
+    for file in (file for file in sorted(poses.glob("*.json")) if _states_pose(file)):
+        if (image := find_image(photos, f"{file.stem}.jpg", file)) is None:
+            absent.append(file.stem)
+            continue
+        try:
+            records.append(_record(image, file))
+        except InputError as error:
+            unusable.append(error)
+    maps = [picture for picture in list_images(photos, LDR_SUFFIXES) if is_depth_map(picture)]
+    notes = [*unusable_notes(unusable, len(records) + len(unusable)), *absent_note(absent, len(records))]
+    notes += ["poses are the app's: to find cameras by structure from motion, give a folder with the photos alone"]
+    mentioned = tuple(picture.name for picture in maps)
+    return DataparserOutputs("arkit", tuple(records), notes=(*notes, *maps_note(maps)), mentioned=mentioned)
+
+
+def _states_pose(file: Path) -> bool:
+    """Return whether a file can be read and states a pose; a pipe would block."""
+    head = b""
+    if file.is_file():
+        with suppress(OSError), file.open("rb") as opened:
+            head = opened.read(1 << 16)
+    return any(mark in head for mark in _MARKS)
+
+
+def _record(image: Path, file: Path) -> ImageRecord:
+    """Return a photo with its camera; raise InputError if the file states no usable one."""
+    values = read_json(file)
+    try:
+        if "t_00" in values:
+            numbers, lens = [values[key] for key in _POLYCAM], [values[key] for key in ("fx", "fy", "cx", "cy")]
+            width, height = int(values["width"]), int(values["height"])
+        else:
+            numbers, (fx, _, cx, _, fy, cy) = values["cameraPoseARFrame"], values["intrinsics"][:6]
+            lens, (width, height) = (fx, fy, cx, cy), photo_sizes(image)[0]
+        matrix, params = np.array(numbers, np.float64).reshape(-1, 4), tuple(float(number) for number in lens)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(file, f"states no usable pose and lens ({error!r:.60})", _REMEDY) from None
+    pose = pose_from_opengl(matrix, file, image.name)
+    return ImageRecord(image.stem, image, Lens("PINHOLE", width, height, params, file), pose)
