@@ -150,7 +150,7 @@ def parse_dataset(
     if holdout is not None and holdout < 0:
         raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
     folder = _folder(path)
-    dataset = read_video(folder, cache) if is_video(folder) else _read(folder)
+    dataset = read_video(folder, cache) if is_video(folder) else _read(folder, scans=not cameras)
     name = str(path) if is_embedded(path) else folder.resolve().name
     folder = folder if dataset.folder == Path() else dataset.folder
     if not dataset.records:
@@ -212,8 +212,11 @@ def _folder(path: Path | str) -> Path:
     return folder
 
 
-def _read(folder: Path) -> DataparserOutputs:
-    """Parse by the first layout that fits, the most specific one first; a file as transforms.json."""
+def _read(folder: Path, *, scans: bool) -> DataparserOutputs:
+    """Parse by the first layout that fits, the most specific one first; a file as transforms.json.
+
+    Scans are layouts only if `scans`: runs of versions before have their photos with cameras of their own.
+    """
     if folder.is_file():
         return replace(read_transforms(folder.parent, folder), folder=folder.parent)
 
@@ -233,13 +236,13 @@ def _read(folder: Path) -> DataparserOutputs:
         (posed is not None and model_fits(folder, posed), partial(read_colmap, source=model)),
         (find_reconstruction(folder) is not None, read_opensfm),
         (has("poses_bounds.npy"), read_llff),
-        (find_scan(folder) is not None, read_scan),
+        (scans and find_scan(folder) is not None, read_scan),
         (model != posed, partial(read_colmap, source=model)),  # Refused: nothing else has poses.
     )
     reader = next((reader for fits, reader in readers if fits), None)
     if reader is None and model is None and (inner := inner_folder(folder)) is not None:
         note = f"photos are read from {inner.relative_to(folder)}, the only folder with photos"
-        dataset = _read(inner)
+        dataset = _read(inner, scans=scans)
         return replace(dataset, folder=inner, notes=(note, *dataset.notes))
     dataset = (reader or find_photos)(folder)
     if model is not None and posed is None:

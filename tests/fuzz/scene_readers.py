@@ -10,6 +10,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from sehdr_warp.scene import load_cameras, load_scene
+from sehdr_warp.scene.readers.arkit import read_scan
 from sehdr_warp.scene.readers.colmap import read_colmap
 from sehdr_warp.scene.readers.colmap_model import read_ply_points
 from sehdr_warp.scene.readers.hdr_sets import read_hdr_nerf, read_hdr_nerf_real
@@ -19,6 +20,7 @@ from sehdr_warp.scene.readers.transforms import read_transforms
 from sehdr_warp.synth.expose import RadianceView
 from tests.make_scenes import pattern, write_blender, write_colmap, write_llff, write_reinhard
 from tests.output.helpers import camera
+from tests.scene.readers.test_arkit import write as write_scan
 from tests.training.toy import orbit_camera
 
 from .reader import Reader, each
@@ -100,6 +102,10 @@ def make_opensfm(folder: Path) -> None:
     (folder / "reconstruction.json").write_text(json.dumps([model]))
 
 
+def make_scan(folder: Path) -> None:
+    write_scan(folder, "scanner")
+
+
 def make_chan(folder: Path) -> None:
     (folder / "own.chan").write_text("".join(f"{n} 0.5 1.5 {n}.0 10 20 30 45.5\n" for n in range(1, 5)))
 
@@ -117,5 +123,6 @@ READERS = {
     "cameras": Reader(make_cameras, ("*.json",), each(load_cameras), text=True, cost=0.5),
     "cameras-of-others": Reader(make_cameras_of_others, ("*.json",), each(load_cameras), text=True, cost=0.7),
     "opensfm": Reader(make_opensfm, ("reconstruction.json",), read_opensfm, text=True, cost=0.9),
+    "scan": Reader(make_scan, ("*.json",), read_scan, text=True, cost=1),
     "chan": Reader(make_chan, ("*",), each(load_cameras), text=True, cost=1.4),
 }

@@ -7,6 +7,8 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.scene.dataparser import PlacedPhoto
+from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
 from tests.make_scenes import arc_poses, pattern
 
@@ -55,3 +57,13 @@ def test_frames_without_a_photo_are_named_and_damaged_ones_refused(tmp_path):
     write(tmp_path, "scanner", intrinsics=[1, 2])
     with pytest.raises(InputError, match="frame_00000.json: states no usable pose and lens"):
         parse_dataset(tmp_path)
+
+
+def test_a_run_with_cameras_of_its_own_keeps_them(tmp_path):
+    """It was trained before poses of scans were read."""
+    write(tmp_path, "scanner")
+    lens = Lens("SIMPLE_PINHOLE", 64, 48, (20.0, 32, 24), tmp_path)
+    cameras = [PlacedPhoto(f"frame_{i:05d}.jpg", lens, i * np.eye(4), "train", 1.0) for i in range(6)]
+    dataset = parse_dataset(tmp_path, cameras=cameras)
+    assert dataset.format == "photos"
+    assert [record.world_to_camera[0, 0] for record in dataset.records] == list(range(6))
