@@ -69,11 +69,11 @@ def splat_variant(call: Callable[[], torch.Tensor], scene: SplatScene, backward:
     return Variant(lambda: call().backward(cotangent), prepare=scene.clear)
 
 
-def against_float64(scene: SplatScene, most: int, name: str = OURS) -> list[dict]:
+def against_float64(scene: SplatScene, most: int) -> list[dict]:
     """Check our kernels in float32 against float64, on a scene like this of at most `most` Gaussians."""
     small = make_splat_scene(scene.size.reduced(most), scene.channels, scene.device)
     truth = _image_and_gradients(small.to("cpu", torch.float64), rasterize_reference)
-    return _compare(name, "float64", _image_and_gradients(small), truth)
+    return _compare(OURS, "float64", _image_and_gradients(small), truth)
 
 
 @torch.no_grad()

@@ -157,11 +157,11 @@ def instructions_per_microsecond(device: torch.device) -> float:
     return processors * SCHEDULERS * clock
 
 
-def _microseconds(action: Callable[[], object], repetitions: int = 5) -> float:
+def _microseconds(action: Callable[[], object]) -> float:
     """Measure the least time of an action."""
     action()
     times = []
-    for _ in range(repetitions):
+    for _ in range(5):
         first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         first.record()
         action()

@@ -110,17 +110,17 @@ def _milliseconds(variant: Variant, device: torch.device) -> Milliseconds:
     return Milliseconds(first.elapsed_time(last), host)
 
 
-def kernel_milliseconds(variant: Variant, runs: int = 5) -> float:
-    """Return the time of a run's kernels and copies on the GPU, in the mean of some runs.
+def kernel_milliseconds(variant: Variant) -> float:
+    """Return the time of a run's kernels and copies on the GPU, in the mean of five runs.
 
     The process is slower at launching kernels from then on.
     """
     torch.cuda.synchronize()
     with silent_stderr(), profile(activities=[ProfilerActivity.CUDA]) as recorded:
-        for _ in range(runs):
+        for _ in range(5):
             variant.once()
         torch.cuda.synchronize()
-    return sum(event.self_device_time_total for event in recorded.key_averages()) / runs / 1e3
+    return sum(event.self_device_time_total for event in recorded.key_averages()) / 5 / 1e3
 
 
 def wait(device: torch.device) -> None:

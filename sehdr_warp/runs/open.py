@@ -87,7 +87,7 @@ class PhotoRequest:
 
     def of_run(self, config: Config, response: Response, cameras: tuple[CameraEntry, ...]) -> PhotoRequest:
         """Return the request with response, found cameras and splits of a run, so that none of them is decided anew."""
-        placed = [entry.placed for entry in cameras if entry.placed is not None]  # Older runs have none.
+        placed = [entry.placed for entry in cameras if entry.placed is not None]
         options = {"response": response_for_loading(config, response), "cameras": placed}
         return PhotoRequest(self.data, self.options | options, cameras)
 

@@ -164,16 +164,16 @@ class RunFolder:
         config = config_from_dict(read_object(self._no_link(self.config_file)), self.config_file)
         if not self.extension.is_file():
             return config
-        iterations = self._extension("iterations", None, config.schedule.iterations)
+        iterations = self._extension("iterations", config.schedule.iterations)
         return override_config(config, {"schedule.iterations": iterations})
 
     def finished_at(self) -> int:
         """Return the iterations after which the training had finished before it was extended; 0 if it had not."""
-        return self._extension("finished_at", 0) if self.extension.is_file() else 0
+        return self._extension("finished_at") if self.extension.is_file() else 0
 
-    def _extension(self, name: str, default: int | None, least: int = 0) -> int:
-        """Return a number of extension.json, or the default if a file of an earlier version lacks it."""
-        value = read_object(self._no_link(self.extension)).get(name, default)
+    def _extension(self, name: str, least: int = 0) -> int:
+        """Return a number of extension.json."""
+        value = read_object(self._no_link(self.extension)).get(name)
         if not isinstance(value, int) or value < least:
             raise InputError(self.extension, f"{name} = {value!r:.40} is not usable", REMEDY)
         return value
@@ -189,7 +189,7 @@ class RunFolder:
 
     def read_scene(self) -> dict:
         """Return the values of scene.json, see describe_scene()."""
-        return {"notes": []} | read_values(self._no_link(self.scene_file), SceneValues)
+        return read_values(self._no_link(self.scene_file), SceneValues)
 
     def read_cameras(self) -> tuple[CameraEntry, ...]:
         """Return the views of the scene, in its order."""
@@ -273,8 +273,6 @@ class RunFolder:
                 if metadata != confidence_metadata(checkpoint.values["sha256"]):
                     return None
                 stored = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
-            if "clipped_stops" not in stored:  # Of an older run: the most that it can be
-                stored["clipped_stops"] = stored["stops"].minimum(MAX_STOPS * stored["clipped"])
             tensors = {field: stored[name] for field, name in EVIDENCE_TENSORS.items()}
         except PermissionError as error:
             raise UnreadableError(path, error) from None

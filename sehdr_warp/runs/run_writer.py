@@ -272,7 +272,6 @@ def write_confidence(folder: RunFolder, evidence: Evidence, checkpoint_hash: str
 
     folder.refuse_links()
     tensors = {name: getattr(evidence, field) for field, name in EVIDENCE_TENSORS.items()}
-    tensors["confidence"] = evidence.confidence()  # Other versions that read this format require it.
     # One key: safetensors writes several in any order, and the same run is to give the same file.
     metadata = {"sehdr_warp": json.dumps(confidence_metadata(checkpoint_hash), sort_keys=True)}
     data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, metadata)

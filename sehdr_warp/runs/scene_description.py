@@ -90,7 +90,7 @@ def _differing_part(saved: list[dict], current: list[dict]) -> str:
 def _split_photos(description: dict) -> dict[str, str]:
     """Take the photos' signatures out of a description of a scene; return those there are, by the views' names.
 
-    Lenses are taken out, too: older runs have none, and cameras tell of them.
+    Lenses are taken out, too, because cameras tell of them.
     """
     for view in description["views"]:
         view.pop("lens", None)

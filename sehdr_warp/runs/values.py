@@ -208,9 +208,7 @@ class SceneValues(Values):
     """Values of scene.json."""
 
     views: Annotated[list[ViewValues], Field(max_length=1_000_000)]
-    notes: Annotated[
-        list[Annotated[str, Field(max_length=1_000_000)]], Field(max_length=100_000)
-    ] = []  # Some name photos
+    notes: Annotated[list[Annotated[str, Field(max_length=1_000_000)]], Field(max_length=100_000)]  # Some name photos
 
 
 def read_values(path: Path, model: type[BaseModel], remedy: str = REMEDY) -> dict[str, Any]:

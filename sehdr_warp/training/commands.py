@@ -93,9 +93,6 @@ class Train:
     removed_flags: ClassVar[Mapping[str, str]] = {
         **{configs.flag_of(path): advice for path, advice in configs.GONE.items()},
         **{configs.flag_of(path): f"write {configs.flag_of(name)}" for path, name in configs.RENAMED.items()},
-        "--plan": "it is the default; --plan.enabled false trains without",
-        "--predict-hdr": configs.GONE["loss.predictor"],
-        "--set": "every field is a flag, as --loss.clipping false for --set loss.clipping=false",
     }
 
     data: Annotated[Positional[str | None], tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None

@@ -52,7 +52,7 @@ def load_state(trainer: Trainer, state: Checkpoint) -> None:
     trainer.iteration = trainer.first_iteration = values["iteration"]
     trainer.seconds = values["seconds"]
     trainer.gradient_step.step_counters[0] = values["skipped_steps"]
-    trainer.gradient_step.step_counters[2] = values.get("overflowed_steps", 0)
+    trainer.gradient_step.step_counters[2] = values["overflowed_steps"]
 
 
 class TrainingProgress:

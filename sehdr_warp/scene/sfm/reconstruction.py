@@ -134,7 +134,7 @@ def reconstruct(
             for (_, (width, height), device), group in groups.items():
                 params = (_focal_prior(device[-1], width, height), width / 2, height / 2, 0.0)
                 names = [image_name(i) for i in group]
-                _extract(database, work, names, "SIMPLE_RADIAL", params)
+                _extract(database, work, names, params)
             photo_seconds = progress.seconds / count
             progress.update(count)
         _match(database, count, photo_seconds)
@@ -241,12 +241,12 @@ def _device(photo: Path) -> tuple[str, ...]:
             return ("None",) * 4
 
 
-def _extract(database: Path, work: Path, names: list[str], model: str, params) -> None:
+def _extract(database: Path, work: Path, names: list[str], params) -> None:
     """Extract the features of images, in images/ and where masks/ keeps them, that share one camera."""
     import pycolmap
 
     camera_params = ",".join(f"{value:.17g}" for value in params)
-    reader = pycolmap.ImageReaderOptions(camera_model=model, camera_params=camera_params)
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", camera_params=camera_params)
     if (work / "masks").exists():
         reader.mask_path = work / "masks"
     for start in range(0, len(names), 8):  # Eight photos at a time, one on each core.
