@@ -78,8 +78,9 @@ def find_photos(folder: Path) -> DataparserOutputs:
         others = unread_kinds(folder)
         problem = "has no photos and no known layout" + f"; it holds {others}" * bool(others)
         raise InputError(folder, problem, _remedy_without_photos(folder))
-    if len(photos) == 1 and _folders_with_photos(folder):
-        raise InputError(photos[0], "is the only photo there", _remedy_without_photos(folder))
+    if len(photos) < FEWEST_PHOTOS and any(folder / each != photos[0].parent for each in _folders_with_photos(folder)):
+        problem = "is the only photo there" if len(photos) == 1 else f"is one of only {len(photos)} photos there"
+        raise InputError(photos[0], problem, _remedy_without_photos(folder))
     copies = find_copies(photos)
     photos = [photo for photo in photos if photo not in copies]
     _require_photos(photos, folder, len(copies))
@@ -269,6 +270,7 @@ def _remedy_without_photos(folder: Path) -> str:
         if find_model(above) and image_folder(above):
             return f"give {above}"
         if inner := _folders_with_photos(folder):
+            inner.sort(key=lambda each: -len(list_images(image_folder(folder / each) or folder / each, PHOTO_SUFFIXES)))
             poses = "".join(f"; {note}" for note in _foreign_poses(folder))
             together = "; or put photos of one scene into one folder" * (len(inner) > 1)
             return f"give one of its folders with photos: {first_names(inner, 5)}{together}{poses}"

@@ -83,6 +83,14 @@ def test_photos_in_several_folders_belong_into_one(tmp_path):
         parse_dataset(tmp_path)
 
 
+def test_a_folder_of_more_photos_is_named_beside_two_pictures(tmp_path):
+    for folder, count in (("a", 1), ("images", 2), ("renders", 5)):
+        photos(tmp_path / folder, count)
+    remedy = "give one of its folders with photos: renders, images, a; or put"
+    with pytest.raises(InputError, match=f"images/IMG_0.jpg: is one of only 2 photos there; {remedy}"):
+        find_photos(tmp_path)
+
+
 @pytest.mark.parametrize("names", [("100CANON", "101CANON"), ("202409__", "202410_a")])
 def test_folders_of_one_camera_are_one_set(tmp_path, names):
     """A memory card: numbers of files begin again in the second folder."""
