@@ -215,7 +215,7 @@ def _folder(path: Path | str) -> Path:
 def _read(folder: Path, *, scans: bool) -> DataparserOutputs:
     """Parse by the first layout that fits, the most specific one first; a file as transforms.json.
 
-    Scans are layouts only if `scans`: runs of versions before have their photos with cameras of their own.
+    Without `scans` photos of a scan are bare: a run may have found their cameras before poses lay beside them.
     """
     if folder.is_file():
         return replace(read_transforms(folder.parent, folder), folder=folder.parent)

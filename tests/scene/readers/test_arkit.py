@@ -60,7 +60,7 @@ def test_frames_without_a_photo_are_named_and_damaged_ones_refused(tmp_path):
 
 
 def test_a_run_with_cameras_of_its_own_keeps_them(tmp_path):
-    """It was trained before poses of scans were read."""
+    """It may have found them before the poses were copied there."""
     write(tmp_path, "scanner")
     lens = Lens("SIMPLE_PINHOLE", 64, 48, (20.0, 32, 24), tmp_path)
     cameras = [PlacedPhoto(f"frame_{i:05d}.jpg", lens, i * np.eye(4), "train", 1.0) for i in range(6)]
