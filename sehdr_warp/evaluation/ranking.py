@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..subsets import every_nth
 from .metrics import mu_law
 from .protocols import log_ratios, median_factor
 
@@ -55,9 +56,8 @@ class ErrorRanking:
         """
         inside = torch.ones_like(well_exposed) if mask is None else mask > 0.5
         max_truth = float(truth[inside].max()) if bool(inside.any()) else 0.0
-        step = max(1, -(-int(inside.sum()) // MAX_PIXELS))
         images = (confidence.double(), prediction.double().clamp_min(0), truth.double(), well_exposed)
-        pixels = (image[inside][::step].cpu() for image in images)
+        pixels = (every_nth(image[inside], MAX_PIXELS).cpu() for image in images)
         self._views.append(ViewPixels(*pixels, black=black, max_truth=max_truth or 1.0))
 
     def result(self) -> dict:

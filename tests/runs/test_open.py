@@ -12,6 +12,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.runs import open as opening
 from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import CameraEntry, RunFolder
 from sehdr_warp.scene import load_scene
@@ -133,57 +134,39 @@ def test_photos_of_another_place_are_refused(bare_run, tmp_path, capfd):
     assert "holds none of the 9 photos that the run was trained with" in error
 
 
-def without_lenses(run):
-    """Turn the files of a run into those of an older one, whose cameras are found anew."""
-    scene_file = run / "scene.json"
-    scene = json.loads(scene_file.read_text())
-    for view in scene["views"]:
-        assert view.pop("lens")
-    scene_file.write_text(json.dumps(scene))
-    for file in run.glob("checkpoints/*/checkpoint.json"):
-        values = json.loads(file.read_text())
-        values["run"]["scene.json"] = RunFolder(run).hashes()["scene.json"]
-        file.write_text(json.dumps(values))
+def test_a_scene_that_python_loads_anew_is_trained_in_the_world_of_its_run(bare_run, monkeypatch, tmp_path):
+    """load_scene() does not know the run, so structure from motion may find another world, or other cameras."""
+    folder, run, cameras = bare_run
+    saved, same = (run / "scene.json").read_bytes(), tmp_path / "same"
+    shutil.copytree(run, same)
+    config = override_config(RunFolder(run).read_config(), {"schedule.iterations": 40})
 
+    def resumed(place, found):
+        find_cameras(monkeypatch, found)
+        scene = load_scene(folder, max_size=40, response="srgb")
+        return create_trainer(scene, place, config, resume=True, device="cpu")
 
-def test_cameras_that_differ_from_those_of_an_older_run_are_refused(bare_run, monkeypatch, capfd):
-    _, run, cameras = bare_run
-    without_lenses(run)
-    assert call("eval", run, "--device", "cpu", "-q") == 0
     moved = {}
     for name, camera in cameras.items():
         pose = camera.world_to_camera.copy()
         pose[:3, 3] *= 1 + 0.2 * len(moved)
         moved[name] = replace(camera, world_to_camera=pose)
-    find_cameras(monkeypatch, moved)
-    for command in (["eval", run, "--device", "cpu"], ["train", "--resume", "--out", run, "--iterations", 40]):
-        assert "9 of 9 photos have other cameras than" in refused(capfd, *command)
-
-
-def test_an_older_run_goes_on_in_its_world_if_structure_from_motion_finds_another(bare_run, monkeypatch, tmp_path):
-    """The Gaussians that are trained further, and figures before and after, are those of the same world."""
-    folder, run, cameras = bare_run
-    without_lenses(run)
-    saved, same = (run / "scene.json").read_bytes(), tmp_path / "same"
-    shutil.copytree(run, same)
+    with pytest.raises(InputError, match="9 of 9 photos have other cameras than"):
+        resumed(run, moved)
     other = {name: in_other_world(camera) for name, camera in cameras.items()}
     zoomed = {name: replace(camera, fx=1.0001 * camera.fx) for name, camera in other.items()}
-    results = []
-    for place, found in ((same, cameras), (run, zoomed)):
-        find_cameras(monkeypatch, found)
-        assert call("train", "--resume", "--out", place, "--iterations", 40, "--device", "cpu") == 0
-        results.append(load_run(place))
+    trainer = resumed(run, zoomed)
+    np.testing.assert_array_equal(
+        [view.camera.world_to_camera for view in trainer.scene.views],
+        [entry.camera.world_to_camera for entry in RunFolder(run).read_cameras()],
+    )
+    results = resumed(same, cameras).train(), trainer.train()
     first, second = (result.field.gaussians.means.detach().numpy() for result in results)
     assert first.shape == second.shape
     np.testing.assert_allclose(first, second, atol=0.02)
     assert (run / "scene.json").read_bytes() == saved
     scores = [result.metrics()[-1]["psnr_ldr"] for result in results]
     assert abs(scores[0] - scores[1]) < 0.2, scores
-    trainer = create_trainer(load_scene(folder, max_size=40, response="srgb"), run, resume=True, device="cpu")
-    np.testing.assert_array_equal(
-        [view.camera.world_to_camera for view in trainer.scene.views],
-        [entry.camera.world_to_camera for entry in RunFolder(run).read_cameras()],
-    )
 
 
 def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_the_run():
@@ -226,14 +209,11 @@ def test_the_castle_goes_on_if_its_cameras_are_found_again(tmp_path, shared, mon
     for photo in (shared / "data" / "castle").glob("*.JPG"):
         with Image.open(photo) as image:
             image.reduce(6).save(tmp_path / "photos" / photo.name, exif=image.getexif(), quality=95)
-    run, options = tmp_path / "run", ["--device", "cpu", "--iterations"]
+    run = tmp_path / "run"
     monkeypatch.setenv("SEHDR_CACHE", str(tmp_path / "first"))
-    assert call("train", tmp_path / "photos", "--out", run, *TRAIN.split(), *options[2:], 4) == 0
-    without_lenses(run)
+    assert call("train", tmp_path / "photos", "--out", run, *TRAIN.split(), "--iterations", 4) == 0
     monkeypatch.setenv("SEHDR_CACHE", str(tmp_path / "second"))
     monkeypatch.setattr(reconstruction, "SEED", reconstruction.SEED + 1)
-    assert call("train", "--resume", "--out", run, *options, 8) == 0
-    assert load_run(run).iterations == 8
     scene, saved = load_scene(tmp_path / "photos", max_size=40, response="srgb"), RunFolder(run).read_cameras()
     found, known = ([each.camera.world_to_camera for each in views] for views in (scene.views, saved))
     assert not np.array_equal(found, known)
