@@ -5,12 +5,12 @@ import json
 import struct
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.io import savemat
 
-from sehdr_warp.errors import SehdrError
 from sehdr_warp.output.cameras.exchange import usd_cameras
 from sehdr_warp.output.images.ocio import ocio_view
 from sehdr_warp.own_files import LIST
@@ -85,14 +85,7 @@ def read_sog(folder: Path):
     with zipfile.ZipFile(folder / "b.sog", "w") as archive:
         for part in sorted((folder / "parts").iterdir()):
             archive.write(part, part.name)
-    problem = None
-    for name in ("a.sog", "b.sog"):
-        try:
-            read_gaussians(folder / name)
-        except SehdrError as error:
-            problem = problem or error
-    if problem:
-        raise problem
+    each(*(partial(lambda name, folder: read_gaussians(folder / name), name) for name in ("a.sog", "b.sog")))(folder)
 
 
 def make_streamed(folder: Path) -> None:

@@ -110,15 +110,7 @@ def make_facts(folder: Path) -> None:
 
 def read_facts(folder: Path) -> None:
     """Damage what users add to a run; its own files are whole."""
-    run = load_run(folder)
-    problem = None
-    for read in (read_light_unit, read_orientation, lambda run: run.folder.read_config()):
-        try:
-            read(run)
-        except SehdrError as error:
-            problem = problem or error
-    if problem:
-        raise problem
+    each(read_light_unit, read_orientation, lambda run: run.folder.read_config())(load_run(folder))
 
 
 RUN_FILES = ("*.json", "metrics.jsonl")

@@ -96,7 +96,7 @@ def test_images_are_numbered_by_name_however_long_their_features_take(tmp_path):
         blocks = random.integers(0, 255, (60, 80), np.uint8)
         pixels = np.kron(blocks, np.ones((6, 6), np.uint8)) if index == 0 else np.full((360, 480), 99, np.uint8)
         Image.fromarray(pixels).save(tmp_path / "images" / name)
-    sfm._extract(tmp_path / "database.db", tmp_path, names, "SIMPLE_RADIAL", (600.0, 240.0, 180.0, 0.0))
+    sfm._extract(tmp_path / "database.db", tmp_path, names, (600.0, 240.0, 180.0, 0.0))
     with pycolmap.Database.open(tmp_path / "database.db") as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
         assert [image.name for image in images] == names
