@@ -98,11 +98,7 @@ def camera_file_of(path: Path) -> Path:
 
 def cameras_beside(path: Path) -> Path | None:
     """Return the file beside a file of Gaussians that holds cameras in its coordinates; None if there is none."""
-    files, suffix = [camera_file_of(path), path.with_name("cameras.json")], path.suffix.lower()
-    # Earlier versions wrote scene.cameras.json. Beside several files scene.*, whose axes differ, it is the PLY's.
-    others = (path.with_name(path.stem + other) for other in SUFFIXES if other != suffix)
-    if suffix == ".ply" or not any(other.exists() for other in others):
-        files.insert(1, path.with_name(f"{path.stem}.cameras.json"))
+    files = camera_file_of(path), path.with_name("cameras.json")
     return next((file for file in files if file.is_file()), None)
 
 

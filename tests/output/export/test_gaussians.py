@@ -117,10 +117,6 @@ def test_cameras_are_of_one_file_and_not_of_another_with_its_stem(tmp_path, run)
     export(run, tmp_path / "a.ply", cameras=True)
     export(run, tmp_path / "a.glb")
     assert load_splats(tmp_path / "a.glb").cameras == () and len(load_splats(tmp_path / "a.ply").cameras) == 3
-    (tmp_path / "a.ply.cameras.json").rename(tmp_path / "a.cameras.json")  # Its earlier name
-    assert load_splats(tmp_path / "a.glb").cameras == () and len(load_splats(tmp_path / "a.ply").cameras) == 3
-    (tmp_path / "a.ply").unlink()
-    assert len(load_splats(tmp_path / "a.glb").cameras) == 3, "a file that is alone has cameras of the earlier name"
 
 
 def test_a_scene_that_does_not_fit_into_the_device_is_exported_as_light_alone(tmp_path, run, logged):
