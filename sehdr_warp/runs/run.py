@@ -350,7 +350,7 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
     """Return the RadianceField of a checkpoint, on the CPU; raises InputError if tensors are missing or do not fit."""
     try:
         gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
-        normalization = Normalization.from_dict(info.get("normalization"))
+        normalization = Normalization.from_dict(info["normalization"])
         response = Response.from_dict(info["response"])
         field = assemble_field(gaussians, config, response, info["base_time"], normalization)
         learned = field.response if isinstance(field.response, torch.nn.Module) else None

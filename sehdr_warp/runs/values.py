@@ -108,7 +108,7 @@ class RunValues(Values):
     data: DataValues
     base_time: Annotated[float, Field(ge=SHORTEST, le=LONGEST)]
     response: dict[str, Any]
-    normalization: NormalizationValues | None = None
+    normalization: NormalizationValues
     color_matrix: Annotated[list[_Row], _Three] | None = None
     exposure_compensation: GainValues | None = None
     up: UpValues | None = None

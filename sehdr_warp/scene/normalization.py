@@ -75,9 +75,9 @@ class Normalization:
         return {"center": self.center.tolist(), "unit": self.unit}
 
     @staticmethod
-    def from_dict(values: dict | None) -> "Normalization":
-        """Return the normalization that to_dict described; None (runs before version 0.3) is the identity."""
-        return Normalization() if values is None else Normalization(np.array(values["center"]), float(values["unit"]))
+    def from_dict(values: dict) -> "Normalization":
+        """Return the normalization that to_dict described."""
+        return Normalization(np.array(values["center"]), float(values["unit"]))
 
 
 def normalization_of(scene: Scene) -> Normalization:

@@ -180,7 +180,7 @@ def _resumed_trainer(
         require_same_config(config, saved, folder.config_file, "resume with the run's own config, or train anew")
     # The Gaussians are in the world that structure from motion found when the training began.
     cameras = {entry.name: entry.camera for entry in folder.read_cameras()} if scene.format in FOUND else {}
-    unit = Normalization.from_dict(info.get("normalization")).unit
+    unit = Normalization.from_dict(info["normalization"]).unit
     scene = in_world_of_run(scene, cameras, unit, folder.path, scene.name)
     folder.check_same_scene(scene)
     checkpoint = folder.newest_checkpoint()

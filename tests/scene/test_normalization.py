@@ -49,7 +49,6 @@ def test_points_and_cameras_return_to_the_scene():
     points = UTM + np.random.default_rng(1).normal(size=(5, 3))
     np.testing.assert_allclose(normalization.scene_points(normalization.points(points)), points, rtol=0, atol=1e-8)
     assert Normalization.from_dict(normalization.to_dict()).to_dict() == normalization.to_dict()
-    assert Normalization.from_dict(None).is_identity
     camera = ring().views[0].camera
     assert Normalization().camera(camera) is camera
 
