@@ -328,8 +328,9 @@ def _certain_radiance(group: _Candidates, photos: _Photos) -> np.ndarray:
     darkest = np.where(clips, photos.whites[:, None, None], 0.0).max(0)
     dark = (clips & (photos.whites[:, None, None] >= darkest)) * group.angles[..., None]
     of_darkest = dark.sum(0) / np.maximum(angles, 1e-30)[:, None]
-    # If fewer values clip, the scene is brighter than some photos, which may be the darkest ones alone.
-    missing = np.minimum((1 - EXPECTED_CLIPPED) * expected[:, None], (1 - DARKEST_CLIPPED) * of_darkest)
+    # If fewer values clip, the scene is brighter than some photos, which may be the darkest ones alone, and in one
+    # channel alone, which counts a third.
+    missing = np.minimum((1 - EXPECTED_CLIPPED) * expected[:, None], (1 - DARKEST_CLIPPED) * of_darkest / 3)
     sure = np.where((expected - group.clipped)[:, None] <= missing, darkest, 0.0)
     bound = np.minimum(np.maximum(sure, photos.white), radiance)
     return np.average(bound, axis=0, weights=np.maximum(angles, 1e-30))

@@ -267,6 +267,14 @@ def test_one_dark_photo_of_many_raises_the_lower_bound_only_if_it_clips():
     assert light.lower_bound.max() < 9.6
 
 
+def test_a_channel_that_dark_photos_do_not_clip_keeps_a_bound_below_its_light():
+    shots = [(camera, 1.0) for camera, _ in 4 * small_views()]
+    shots[:3] = [(camera, 1 / 16) for camera, _ in shots[:3]]
+    scene, truth = field(panel(), (24.0, 24.0, 24.0), 0.03), field(panel(), (24.0, 24.0, 8.0), 0.03)
+    (light,) = find_lights(scene, photograph(scene, shots, truth), shots)
+    assert light.lower_bound[2] < 8
+
+
 def test_errors_of_unclipped_values_count_if_these_measure_a_light():
     """The scene has a quarter of the light that six dark photos show. Six others clip it."""
     scene, truth = field(panel(), RADIANCE / 8, 0.03), field(panel(), RADIANCE / 2, 0.03)
