@@ -143,7 +143,7 @@ class AdcStrategy(Strategy):
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue with the statistics of state_dict()."""
-        self.gradient_sum, self.photo_count = state.get("gradient_sum"), state.get("photo_count")
+        self.gradient_sum, self.photo_count = (state["gradient_sum"], state["photo_count"]) if state else (None, None)
 
 
 def sample_half(gaussians: Gaussians, parents: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
