@@ -56,7 +56,8 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         place = os.path.commonpath([file.parent for file in photos])
         where = Path(place).relative_to(folder).as_posix() if Path(place) != folder else "the folder"
         count = counted(len(photos), f"photo of {where} is", f"photos of {where} are")
-        few = len(photos) > len(images) and Path(place) != folder  # Structure from motion before may have failed.
+        # Structure from motion before may have failed, if all photos lie in one folder.
+        few = len(photos) > len(images) and {image.parent for image in images} == {Path(place)} != {folder}
         remedy = f"; to find cameras of all photos anew, give {place}" * few
         notes.append(f"{count} in no view: {first_names([file.name for file in photos])}{remedy}")
     if broken:

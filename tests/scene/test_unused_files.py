@@ -41,6 +41,9 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     assert said(load(tmp_path / "folders"), "in no view")[0].startswith(
         "6 photos of images/right are in no view: 000.png"
     )
+    shutil.copytree(tmp_path / "folders/images/left", tmp_path / "folders/images/right/more")
+    (note,) = said(load(tmp_path / "folders"), "in no view")  # Not all photos lie there.
+    assert note.startswith("12 photos of images/right") and "anew" not in note
     (tmp_path / "plain").mkdir()
     write_colmap(tmp_path / "plain")
     assert not said(load(tmp_path / "plain"), "in no view") and not said(load(tmp_path / "plain"), "not read")
