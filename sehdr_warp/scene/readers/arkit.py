@@ -13,10 +13,10 @@ import numpy as np
 from ...errors import InputError
 from ...files import read_json
 from ..dataparser import DataparserOutputs, ImageRecord
-from ..file_names import find_image, list_images
-from ..images.ldr_files import LDR_SUFFIXES
+from ..file_names import find_image, list_images, natural_key
+from ..images.ldr_files import LDR_SUFFIXES, PHOTO_SUFFIXES
 from ..lens import Lens
-from ..photos import photo_sizes, unusable_notes
+from ..photos import FEWEST_PHOTOS, photo_sizes, unusable_notes
 from .photo_copies import is_depth_map, maps_note
 from .transforms import absent_note, pose_from_opengl
 
@@ -26,16 +26,17 @@ _PLACES = tuple(
 _POLYCAM = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _MARKS = (b'"cameraPoseARFrame"', b'"t_00"')
 _MOST_READ = 20  # Files whose content is looked at
-_REMEDY = "export the scan again"
+_REMEDY = "export the scan again, or give a folder with the photos alone"
 
 
 def find_scan(folder: Path) -> tuple[Path, Path] | None:
-    """Return the folders of photos and of their poses, None if no photo has a file with a pose."""
+    """Return the folders of photos and of their poses, None if fewer photos than a training needs have one."""
     for images, cameras in (*_PLACES, (".", ".")):
         photos, poses = folder / images, folder / cameras
         if photos.is_dir() and poses.is_dir():
-            files = itertools.islice(sorted(poses.glob("*.json")), _MOST_READ)
-            if any(_states_pose(file) and find_image(photos, f"{file.stem}.jpg", file) for file in files):
+            files = (poses / f"{photo.stem}.json" for photo in list_images(photos, PHOTO_SUFFIXES))
+            present = itertools.islice((file for file in files if file.is_file()), _MOST_READ)
+            if sum(map(_states_pose, present)) >= FEWEST_PHOTOS:
                 return photos, poses
     return None
 
@@ -46,7 +47,7 @@ def read_scan(folder: Path) -> DataparserOutputs:
     assert places is not None
     photos, poses = places
     records, absent, unusable = [], [], []
-    for file in (file for file in sorted(poses.glob("*.json")) if _states_pose(file)):
+    for file in filter(_states_pose, sorted(poses.glob("*.json"), key=lambda file: natural_key(file.name))):
         if (image := find_image(photos, f"{file.stem}.jpg", file)) is None:
             absent.append(file.stem)
             continue

@@ -27,6 +27,7 @@ from ..sfm.panoramas import are_panoramas, reconstruct_panoramas
 from ..sfm.reconstruction import Reconstruction, reconstruct
 from ..unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from ..video.decode import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
+from .arkit import find_scan
 from .colmap import INPUT
 from .colmap_model import find_model
 from .photo_copies import copies_note, find_copies, is_depth_map, maps_note
@@ -68,7 +69,8 @@ def find_photos(folder: Path) -> DataparserOutputs:
     places = (place for place in (folder, folder / "images", folder / INPUT) if place.is_dir())
     listed = [list_images(place, PHOTO_SUFFIXES) for place in places]
     maps = {picture for pictures in listed for picture in pictures if is_depth_map(picture)}
-    candidates = [[picture for picture in pictures if picture not in maps] for pictures in listed]
+    # Pictures without others beside them are grey photos with such a word in their names.
+    candidates = [[picture for picture in pictures if picture not in maps] or pictures for pictures in listed]
     photos = max(candidates, key=len)  # Fewer pictures beside `images/` are a cover, or pictures of results.
     together = _folders_of_a_camera(folder) if not photos else []
     photos = photos or [photo for place in together for photo in list_images(folder / place, PHOTO_SUFFIXES)]
@@ -85,7 +87,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
     photos = [photo for photo in photos if photo not in copies]
     _require_photos(photos, folder, len(copies))
     notes = [*copies_note(copies), *_foreign_poses(folder), *_cameras_above(folder)]
-    maps = sorted(picture for picture in maps if picture.parent == photos[0].parent)
+    maps = sorted(picture for picture in maps.difference(photos) if picture.parent == photos[0].parent)
     notes += maps_note(maps)
     if together:
         counts = Counter(photo.parent for photo in photos)
@@ -299,7 +301,7 @@ def _folders_with_photos(folder: Path) -> list[str]:
         if place.parts and list_images(folder / place, PHOTO_SUFFIXES):
             above = folder / place.parent
             has_cameras = any((above / name).is_file() for name in _CAMERA_FILES) or find_model(above) is not None
-            is_set = place.parent.parts and has_cameras
+            is_set = place.parent.parts and (has_cameras or find_scan(above) is not None)
             result[(place.parent if is_set else place).as_posix()] = None
     return list(result)
 
@@ -308,6 +310,8 @@ def _cameras_above(folder: Path) -> list[str]:
     """Return a note if the folder above holds cameras of a set to which the photos may belong."""
     above = folder.resolve().parent
     files = [above / name for name in _CAMERA_FILES if (above / name).is_file()]
+    scan = find_scan(above)
+    files += [scan[1]] if scan is not None and scan[0] == folder.resolve() else []
     cameras = find_model(above) or next(iter(files), None)
     return (
         [] if cameras is None else [f"cameras of {cameras} are not used, cameras are found anew: give {above} for them"]

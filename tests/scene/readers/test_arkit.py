@@ -1,6 +1,7 @@
 """Scans of phones, written as 3D Scanner App and Polycam do."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.scene.dataparser import PlacedPhoto
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
+from sehdr_warp.scene.readers.arkit import find_scan
+from sehdr_warp.scene.readers.bare_photos import find_photos
 from tests.make_scenes import arc_poses, pattern
 
 LENS = (50.0, 52.0, 30.0, 25.0)
@@ -67,3 +70,22 @@ def test_a_run_with_cameras_of_its_own_keeps_them(tmp_path):
     dataset = parse_dataset(tmp_path, cameras=cameras)
     assert dataset.format == "photos"
     assert [record.world_to_camera[0, 0] for record in dataset.records] == list(range(6))
+
+
+def test_photos_of_which_two_have_a_pose_are_bare(tmp_path):
+    """As a set to which a few frames of a scan were added."""
+    write(tmp_path, "scanner")
+    for file in sorted(tmp_path.glob("*.json"))[2:]:
+        file.unlink()
+    assert find_scan(tmp_path) is None
+    assert len(find_photos(tmp_path).records) == 6
+
+
+def test_a_scan_is_found_in_a_folder_and_named_if_its_photos_alone_are_given(tmp_path):
+    write(tmp_path / "scan", "polycam")
+    shutil.copytree(tmp_path / "scan/keyframes/corrected_images", tmp_path / "scan/keyframes/images")
+    dataset = parse_dataset(tmp_path)
+    assert dataset.format == "arkit" and dataset.folder == tmp_path / "scan/keyframes"
+    photos = tmp_path / "scan/keyframes/corrected_images"
+    note = f"cameras of {photos.with_name('corrected_cameras')} are not used"
+    assert any(each.startswith(note) for each in find_photos(photos).notes)

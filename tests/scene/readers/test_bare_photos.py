@@ -154,6 +154,13 @@ def test_depth_and_confidence_beside_photos_are_not_photos(tmp_path):
     assert unused_notes(tmp_path, dataset.records, dataset.mentioned) == []
 
 
+def test_grey_photos_of_a_conference_room_are_photos(tmp_path):
+    for i in range(4):
+        Image.fromarray(pattern(16, 12, i)[..., 0]).save(tmp_path / f"conf_room_{i}.png")
+    dataset = find_photos(tmp_path)
+    assert len(dataset.records) == 4 and dataset.notes == ()
+
+
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
     ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"), ("frame_00000.json", "3D Scanner App"),
