@@ -24,7 +24,7 @@ import json
 import math
 import os
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, SehdrError
@@ -58,6 +58,8 @@ NEW, READY = ".new", ".ready"
 _GIVE_RUN = "give the folder that a training wrote"
 _REMOVE_FILE = "remove this file, which a run does not need, or train again"
 _MAKE_AGAIN = "remove this file; `sehdr-warp report` makes it again from the photos"
+EVIDENCE_TENSORS = {"weight_sum": "seen"} | {name: name for name in ("stops", "clipped", "peak", "clipped_stops")}
+"""Name in confidence.safetensors of each field of Evidence."""
 _MOST_STOPS = 2.5 * MAX_STOPS  # A misfit and a deviation, each at most MAX_STOPS, and rounding
 
 
@@ -271,7 +273,7 @@ class RunFolder:
                 if metadata != confidence_metadata(checkpoint.values["sha256"]):
                     return None
                 stored = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
-            tensors = {field.name: stored[field.name] for field in fields(Evidence)}
+            tensors = {field: stored[name] for field, name in EVIDENCE_TENSORS.items()}
         except PermissionError as error:
             raise UnreadableError(path, error) from None
         except (SafetensorError, OSError, ValueError, KeyError, RuntimeError, RecursionError) as error:
@@ -279,11 +281,11 @@ class RunFolder:
         expected = checkpoint.tensors["gaussians.means"].shape[:1]
         for name, values in tensors.items():
             if values.shape != expected:
-                problem = f"{name} has shape {tuple(values.shape)}, not {tuple(expected)}"
+                problem = f"{EVIDENCE_TENSORS[name]} has shape {tuple(values.shape)}, not {tuple(expected)}"
                 raise InputError(path, problem, _MAKE_AGAIN)
             most = {"clipped": 1.0, "stops": _MOST_STOPS, "clipped_stops": _MOST_STOPS}.get(name, math.inf)
             if not bool(((values >= 0) & (values <= most) & values.isfinite()).all()):
-                problem = f"{name} holds values outside of 0 to {most:g}"
+                problem = f"{EVIDENCE_TENSORS[name]} holds values outside of 0 to {most:g}"
                 raise InputError(path, problem, _MAKE_AGAIN)
         return Evidence(**tensors)
 

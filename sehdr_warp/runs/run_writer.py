@@ -26,7 +26,7 @@ from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.gravity import find_up
 from .checkpoint import TENSORS, VALUES, Checkpoint, read_checkpoint, remove_checkpoint
 from .config import Config
-from .run_folder import NEW, READY, RunFolder, confidence_metadata
+from .run_folder import EVIDENCE_TENSORS, NEW, READY, RunFolder, confidence_metadata
 from .scene_description import describe_scene
 from .values import FORMAT, LoadArguments, read_object, require_readable
 
@@ -271,9 +271,10 @@ def write_confidence(folder: RunFolder, evidence: Evidence, checkpoint_hash: str
     from safetensors.torch import save
 
     folder.refuse_links()
+    tensors = {name: getattr(evidence, field) for field, name in EVIDENCE_TENSORS.items()}
     # One key: safetensors writes several in any order, and the same run is to give the same file.
     metadata = {"sehdr_warp": json.dumps(confidence_metadata(checkpoint_hash), sort_keys=True)}
-    data = save({name: value.float().cpu().contiguous() for name, value in vars(evidence).items()}, metadata)
+    data = save({name: value.float().cpu().contiguous() for name, value in tensors.items()}, metadata)
     with atomic_path(folder.confidence, internal=True) as beside:
         beside.write_bytes(data)
 

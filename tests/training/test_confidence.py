@@ -32,7 +32,7 @@ def test_a_training_leaves_its_confidence(trained, scene):
     assert torch.equal(confidence, trained.field.confidence)
     assert confidence.shape == (trained.gaussian_count,) and 0 <= confidence.min() < confidence.max() <= 1
     saved = load_file(trained.folder.confidence)
-    assert sorted(saved) == ["clipped", "clipped_stops", "peak", "stops", "weight_sum"]
+    assert sorted(saved) == ["clipped", "clipped_stops", "peak", "seen", "stops"]
     confidence_image = trained.render_confidence(scene.test_views[0].camera)
     assert confidence_image.shape == (32, 32) and 0 < confidence_image.max() <= 1
 

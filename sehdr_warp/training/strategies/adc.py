@@ -137,13 +137,13 @@ class AdcStrategy(Strategy):
         gaussians.overwrite({"opacity_logits": logits}, optimizer)
 
     def state_dict(self, count: int) -> dict[str, Tensor]:
-        """Return the gradient statistics of `count` Gaussians."""
-        statistics = {"gradient_sum": self.gradient_sum, "photo_count": self.photo_count}
+        """Return the gradient statistics of `count` Gaussians; checkpoints call photo_count `seen`."""
+        statistics = {"gradient_sum": self.gradient_sum, "seen": self.photo_count}
         return {name: values[:count] for name, values in statistics.items() if values is not None}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue with the statistics of state_dict()."""
-        self.gradient_sum, self.photo_count = (state["gradient_sum"], state["photo_count"]) if state else (None, None)
+        self.gradient_sum, self.photo_count = state.get("gradient_sum"), state.get("seen")
 
 
 def sample_half(gaussians: Gaussians, parents: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
