@@ -42,6 +42,7 @@ def _folder_of(names: Sequence[str], folder: Path) -> Path | None:
     """Return the folder of a set, or one directly in it, that holds photos under the exact names.
 
     Numbers such as 1.jpg may be names of several captures: the folder with most of the names and fewest others counts.
+    The set's own folder comes first: folders in it may hold smaller copies of its photos.
     """
     places = [
         folder,
@@ -51,7 +52,7 @@ def _folder_of(names: Sequence[str], folder: Path) -> Path | None:
     inner = [name for name in inner if not PurePosixPath(name).is_absolute() and ".." not in name]
     present = [sum((place / name).is_file() for name in inner) for place in places]
     fitting = [place for place, count in zip(places, present, strict=True) if count == max(present) > 0]
-    return min(fitting, key=lambda place: len(list_images(place, PHOTO_SUFFIXES)), default=None)
+    return min(fitting, key=lambda place: (place != folder, len(list_images(place, PHOTO_SUFFIXES))), default=None)
 
 
 def read_colmap(folder: Path, source: Path | None = None) -> DataparserOutputs:

@@ -81,6 +81,10 @@ def test_of_folders_with_the_names_of_a_model_the_one_with_fewest_others_counts(
             (tmp_path / folder).mkdir(exist_ok=True)
             Image.fromarray(pattern(64, 48, 20 + i)).save(tmp_path / folder / f"{i:03d}.png")
     assert {record.image.parent.name for record in read_colmap(tmp_path).records} == {"scene"}
+    for photo in (tmp_path / "scene").iterdir():
+        shutil.copy(photo, tmp_path)
+    Image.fromarray(pattern(64, 48, 30)).save(tmp_path / "cover.png")
+    assert {record.image.parent for record in read_colmap(tmp_path).records} == {tmp_path}
 
 
 def test_a_model_that_names_none_of_the_photos_is_not_used_and_named(tmp_path):
