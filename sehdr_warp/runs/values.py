@@ -155,6 +155,7 @@ class SummaryValues(Values):
     device: Text = ""
     peak_memory_bytes: Count | None = None
     peak_gpu_memory_bytes: Count | None = None
+    estimated_light: Annotated[float, Field(ge=0, le=1)] | None = None
     unexplained: UnexplainedValues | None = None
     brightness_offsets: dict[str, _Decibels] | None = None
 

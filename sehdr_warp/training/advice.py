@@ -24,6 +24,7 @@ EXPOSURE_JUMP = 0.4  # Stops between a whole photo and the scene from which its 
 FAILED = 17.0  # dB of held-out photos below which the scene as a whole is wrong: sound captures have 19 to 35
 _FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
+_MUCH_LIGHT = 0.5  # Share of the light in the photos from which it matters most that it is an estimate
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
 
 
@@ -108,6 +109,10 @@ def advice(
     anew = f"{where}: {shlex.join(words)}"
     if misfit:
         return [f"the cameras that the set states do not fit its photos; find them anew {anew}"]
+    if (share := summary.get("estimated_light") or 0.0) > _MUCH_LIGHT:
+        remedy = "three darker photos, in which lamps and windows do not clip, would measure it"
+        listed = f"sehdr-warp lights {run}"
+        lines.append(f"{share:.0%} of the light is an estimate, because photos clip it; {remedy}: {listed}")
     few_placed = 2 * unplaced >= train_photos
     if few_placed:
         lines.append(

@@ -117,7 +117,10 @@ class Plan:
         is_measured = self.facts.unclipped or (self.config.loss.uses_hdr and self.facts.truths)
         if self.facts.clipped_when_dark >= CLIPPED and not is_measured:
             estimated = f"{self.facts.clipped:.1%} of the pixels clip, and their light above white is an estimate"
-            lines.append(f"plan: {estimated}; three photos in which lamps and windows do not clip measure it")
+            remedy = "three photos in which lamps and windows do not clip measure it"
+            if (dark := self.facts.clipped_when_dark) < self.facts.clipped:
+                remedy = f"the darkest photos clip, too ({dark:.1%} of their pixels): {remedy}"
+            lines.append(f"plan: {estimated}; {remedy}")
         return lines + [f"plan: {line}, as you set it" for line in _format_fields(self.user_fields)]
 
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from ..errors import SehdrError
@@ -136,6 +137,7 @@ class RunOutput:
         run.set_evidence(evidence)
         write_confidence(self.folder, evidence, run.checkpoint_hash)
         if not self._is_block:
+            self.folder.write_summary(run.summary() | {"estimated_light": round(estimated_light(run, evidence), 4)})
             self._report_residuals(run, trainer)
 
     def _write_summary(self, trainer: Trainer) -> None:
@@ -172,6 +174,14 @@ class RunOutput:
             self._writer = self._writer or summary_writer()(str(self.folder.tensorboard), purge_step=first)
             for name, value in figures.items():
                 self._writer.add_scalar(f"{split}/{name}", value, trainer.iteration)
+
+
+def estimated_light(run: Run, evidence: Evidence) -> float:
+    """Return the share in [0, 1] of the light in the training photos that they clip, so that it is an estimate."""
+    middle = np.mean([entry.camera.position for entry in run.cameras if entry.split == "train"], 0)
+    radiance = run.field.radiance_towards(middle, degree=run.degree).double().mean(1).clamp_max(1e30)
+    light = radiance * evidence.weight_sum.to(radiance)
+    return float((light * evidence.clipped.to(light)).sum() / light.sum().clamp_min(1e-300))
 
 
 def remove_unseen(trainer: Trainer) -> Evidence:

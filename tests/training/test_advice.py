@@ -33,6 +33,13 @@ def test_gains_before_a_resume_do_not_count():
     assert advice(Path("r"), figures, 50, resumed_at=75) == advice(Path("r"), figures, 50)
 
 
+def test_light_that_is_an_estimate_comes_first():
+    first, second = advice(Path("r"), summary([20, 22, 23, 24]) | {"estimated_light": 0.754}, 50)
+    assert first.startswith("75% of the light is an estimate") and first.endswith("sehdr-warp lights r")
+    assert "more steps help" in second
+    assert len(advice(Path("r"), summary([20, 22, 23, 24]) | {"estimated_light": 0.4}, 50)) == 1
+
+
 def test_many_photos_without_a_camera_are_the_first_advice():
     lines = advice(Path("r"), summary([20, 22, 23, 24]), 8, "photos", unplaced=20)
     assert len(lines) == 2 and lines[0].startswith("20 photos have no camera and are not in the scene;")

@@ -3,7 +3,9 @@ load."""
 
 import json
 import shutil
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -12,6 +14,7 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import ensure_confidence, load_run
 from sehdr_warp.runs.run_folder import confidence_metadata
+from sehdr_warp.scene import codes_of
 from sehdr_warp.training.train import train
 
 
@@ -35,6 +38,14 @@ def test_a_training_leaves_its_confidence(trained, scene):
     assert sorted(saved) == ["clipped", "clipped_stops", "peak", "seen", "stops"]
     confidence_image = trained.render_confidence(scene.test_views[0].camera)
     assert confidence_image.shape == (32, 32) and 0 < confidence_image.max() <= 1
+
+
+@pytest.mark.parametrize(("gain", "least", "most"), [(0.5, 0, 0), (50, 0.8, 1)])
+def test_a_summary_states_which_share_of_the_light_is_an_estimate(scene, tmp_path, gain, least, most):
+    views = tuple(replace(view, codes=codes_of(np.minimum(gain * view.image, 1))) for view in scene.views)
+    config = load_config("demo", {"schedule.iterations": 1, "response.name": "srgb"})
+    run = train(replace(scene, views=views), tmp_path / "run", config, device="cpu")
+    assert least <= run.summary()["estimated_light"] <= most
 
 
 def test_a_run_without_it_gets_it_on_demand(run, scene, caplog):

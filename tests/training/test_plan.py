@@ -122,6 +122,8 @@ def test_photos_that_clip_get_a_line_before_the_training(scene, clipped, is_told
     assert tells() == is_told
     # Light is measured by photos with shorter exposures, and by float pictures.
     assert not tells(clipped_when_dark=0.001) and not tells(unclipped=True)
+    lines = replace(plan, facts=replace(plan.facts, clipped=0.3, clipped_when_dark=0.065)).lines()
+    assert any("the darkest photos clip, too (6.5% of their pixels)" in line for line in lines)
 
 
 def test_brackets_clip_as_much_as_their_darkest_photos(scene):
