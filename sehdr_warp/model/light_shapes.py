@@ -7,6 +7,7 @@ import numpy as np
 
 from ..scene import Camera
 
+REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
 FLATNESS = 0.15  # Ratio of variances below which a light is flat, or thin; the half of a ball that photos show has 0.22
 
 
@@ -52,45 +53,61 @@ def solid_angles(shape: LightShape, cameras: Sequence[Camera]) -> np.ndarray:
     return np.array([shape.solid_angle(camera.position) for camera in cameras])
 
 
-def connected_groups(positions: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Return the connected groups of points that are nearer to each other than `reach`, as indices."""
+def connected_groups(positions: np.ndarray, longest: np.ndarray) -> list[np.ndarray]:
+    """Return the connected groups of Gaussians that are near to each other, as indices.
+
+    Args:
+        positions: [K, 3] centers.
+        longest: [K, 3] longest axes, as long as their standard deviations. Gaussians count at their centers and halfway
+            along these to both sides: few long ones make a strip.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    pairs = KDTree(positions).query_pairs(reach, output_type="ndarray")
+    points = np.concatenate([positions, positions + longest / 2, positions - longest / 2])
+    reach = REACH * float(np.median(np.linalg.norm(longest, axis=1)))
+    pairs = KDTree(points).query_pairs(reach, output_type="ndarray") % len(positions)
     links = coo_matrix((np.ones(len(pairs)), pairs.T), (len(positions), len(positions)))
     count, labels = connected_components(links, directed=False)
     return [np.flatnonzero(labels == label) for label in range(count)]
 
 
-def fitted_shape(positions: np.ndarray, widths: np.ndarray, weights: np.ndarray, viewer: np.ndarray) -> LightShape:
+def fitted_shape(positions: np.ndarray, axes: np.ndarray, weights: np.ndarray, viewer: np.ndarray) -> LightShape:
     """Return the rectangle or sphere with the weighted mean and variances of Gaussians.
 
     A rectangle emits to the side of `viewer` [3]. A thin one, such as a tube or a strip, whose Gaussians are as wide as
     it is, faces that point.
+
+    Args:
+        positions: [K, 3] centers.
+        axes: [K, 3, 3] rows: principal axes, as long as their standard deviations.
+        weights: [K].
+        viewer: [3].
     """
     weights = weights / weights.sum()
     position = weights @ positions
     offsets = positions - position
-    covariance = (offsets * weights[:, None]).T @ offsets
-    values, vectors = np.linalg.eigh(covariance)
     # A Gaussian reaches beyond its center on the light's face, but not across a flat one.
-    spread = float(weights @ widths**2)
-    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1].T
-    if values[2] < FLATNESS * np.sqrt(values[0] * values[1]) and 2 * values[1] > spread:
+    of_centers, own = (offsets * weights[:, None]).T @ offsets, np.einsum("k,kia,kib->ab", weights, axes, axes)
+    longest = float(weights @ (axes**2).sum(2).max(1))
+    values, vectors = (part[..., ::-1].T for part in np.linalg.eigh(of_centers))
+    beyond = np.einsum("ai,ij,aj->a", vectors, own, vectors)
+    if values[2] < FLATNESS * np.sqrt(max(values[0] * values[1], 0.0)) and 2 * values[1] > longest:
         normal = vectors[2] if vectors[2] @ (viewer - position) >= 0 else -vectors[2]
-    elif values[1] < FLATNESS * values[0] and values[0] > spread:
+    else:
+        values, vectors = (part[..., ::-1].T for part in np.linalg.eigh(of_centers + own))
+        beyond = np.zeros(3)
+        if values[1] > FLATNESS * values[0]:
+            diameter = 2 * float(np.sqrt(values.sum()))
+            return LightShape("sphere", position, np.eye(3), (diameter, diameter))
         normal = viewer - position
         normal = normal - (normal @ vectors[0]) * vectors[0]
         length = float(np.linalg.norm(normal))
         normal = normal / length if length > 0 else vectors[2]
-    else:
-        diameter = 2 * float(np.sqrt(values.sum() + spread))
-        return LightShape("sphere", position, np.eye(3), (diameter, diameter))
-    axes = np.stack([vectors[0], np.cross(normal, vectors[0]), normal])
-    width, height = (float(np.sqrt(12 * (value + spread))) for value in values[:2])
-    return LightShape("rect", position, axes, (width, height))
+    sides = np.stack([vectors[0], np.cross(normal, vectors[0]), normal])
+    width, height = (float(np.sqrt(12 * value)) for value in np.maximum(values + beyond, 0)[:2])
+    return LightShape("rect", position, sides, (width, height))
 
 
 def fit_solid_angles(shape: LightShape, received: np.ndarray, places: Sequence[np.ndarray]) -> np.ndarray:

@@ -13,6 +13,7 @@ from ..scene import Camera
 from ..scene.wide_camera import pixels_of_directions, steradians, typical_focal_length
 from ..subsets import every_nth
 from .confidence import RESIDUAL_WEIGHT
+from .gaussians import rotate
 from .light_shapes import LightShape, connected_groups, fit_solid_angles, fitted_shape, solid_angles
 from .radiance_field import RadianceField
 
@@ -20,7 +21,7 @@ CLIPPED = 0.3  # Share of the values of photos too bright for a Gaussian that cl
 BRIGHT = 0.7  # Times white, from which a Gaussian can belong to a light, and from which a photo is too bright for it
 MOST_CLIPPED = 0.1  # Share of all photos' pixels that may clip at the exposure whose white decides what a light is
 LEAST_SEEN = 0.3  # Pixels of blending weight over all views, likewise
-REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
+CORE = 0.75  # Of the share that clips of a light, from which its Gaussians count for its shape
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras, if nothing hides the light from there
 MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
@@ -126,12 +127,14 @@ def find_lights(
     total = max(float(reaches_middle.sum()), 1e-30)
     panoramas: dict[int, ReceivedLight] = {}
     lights = []
-    for rows in connected_groups(candidates.positions, REACH * float(np.median(candidates.widths))):
+    for rows in connected_groups(candidates.positions, candidates.longest):
         group = candidates.rows(rows)
         if group.weights @ group.too_bright < CLIPPED * group.weights.sum():
             continue  # Darker photos alone show most of it and do not clip it, as the part of a walk in the sun.
-        shape = fitted_shape(group.positions, group.widths, group.weights, middle)
-        light_photos = _photos_of_whole_light(photos.cameras, group, shape)
+        # The wall behind a colored tube clips, too, in one channel: its light counts, its place does not.
+        core = group.rows(np.flatnonzero(group.clipped >= CORE * np.average(group.clipped, weights=group.weights)))
+        shape = fitted_shape(core.positions, core.axes, core.weights, middle)
+        light_photos = _whole_in(photos.cameras, group, core, shape)
         if not len(light_photos.photos):
             # Every photo cuts the light off at its border. The one that shows most of it looks beyond that.
             best = int(np.argmax(group.angles.sum(1) * (solid_angles(shape, photos.cameras) > 0)))
@@ -140,7 +143,7 @@ def find_lights(
             around = panoramas[best]
             light_photos = _LightPhotos(
                 np.array([best]),
-                around.angles[group.index].sum(0, keepdim=True).cpu().numpy(),
+                around.angles[core.index].sum(0, keepdim=True).cpu().numpy(),
                 around.light[group.index].sum(0, keepdim=True).cpu().numpy(),
             )
         light_photos = light_photos.without_obstructed(solid_angles(shape, photos.cameras))
@@ -192,7 +195,7 @@ class _Candidates:
     Attributes:
         index: [K] int64, in the scene, on its device.
         positions: [K, 3], scene coordinates.
-        widths: [K] largest standard deviation, scene units.
+        axes: [K, 3, 3] rows: principal axes, as long as their standard deviations, scene units.
         weights: [K] radiance times pixels.
         brightness: [K] radiance of the brightest channel.
         too_bright: [K] whether a photo of the usual exposure clips it.
@@ -205,7 +208,7 @@ class _Candidates:
 
     index: Tensor
     positions: np.ndarray
-    widths: np.ndarray
+    axes: np.ndarray
     weights: np.ndarray
     brightness: np.ndarray
     too_bright: np.ndarray
@@ -215,12 +218,17 @@ class _Candidates:
     angles: np.ndarray
     light: np.ndarray
 
+    @property
+    def longest(self) -> np.ndarray:
+        """The longest of the axes [K, 3]."""
+        return self.axes[np.arange(len(self.axes)), np.linalg.norm(self.axes, axis=2).argmax(1)]
+
     def rows(self, rows: np.ndarray) -> "_Candidates":
         """Return some of the Gaussians."""
         return _Candidates(
             index=self.index[torch.from_numpy(rows).to(self.index.device)],
             positions=self.positions[rows],
-            widths=self.widths[rows],
+            axes=self.axes[rows],
             weights=self.weights[rows],
             brightness=self.brightness[rows],
             too_bright=self.too_bright[rows],
@@ -284,11 +292,13 @@ def _candidates(field: RadianceField, clipped: Tensor, photos: _Photos) -> _Cand
     clips = clipped.to(device) >= CLIPPED * too_bright / weighted.clamp_min(1e-20)
     index = (clips & (photos.pixels > LEAST_SEEN) & (peak > BRIGHT * photos.white)).nonzero()[:, 0]
     gaussians, stops = field.gaussians, field.clipped_stops
+    axes = torch.diag_embed(gaussians.log_scales[index].exp()).flatten(0, 1)
+    axes = rotate(gaussians.quaternions[index].repeat_interleave(3, 0), axes).unflatten(0, (-1, 3))
     confidence = torch.ones_like(peak) if field.confidence is None else field.confidence.to(device)
     return _Candidates(
         index=index,
         positions=field.normalization.scene_points(gaussians.means[index].cpu().numpy()),
-        widths=gaussians.log_scales[index].exp().amax(1).cpu().numpy() * field.normalization.unit,
+        axes=axes.cpu().numpy() * field.normalization.unit,
         weights=(photos.pixels * photos.radiance.mean(1))[index].cpu().numpy(),
         brightness=peak[index].cpu().numpy(),
         too_bright=(too_bright > 0)[index].cpu().numpy(),
@@ -300,11 +310,11 @@ def _candidates(field: RadianceField, clipped: Tensor, photos: _Photos) -> _Cand
     )
 
 
-def _photos_of_whole_light(cameras: Sequence[Camera], group: _Candidates, shape: LightShape) -> _LightPhotos:
+def _whole_in(cameras: Sequence[Camera], group: _Candidates, core: _Candidates, shape: LightShape) -> _LightPhotos:
     """Return the photos that do not cut the light off at their border and see its face."""
-    whole = [_in_frame(camera, group.positions, group.widths, group.weights) for camera in cameras]
+    whole = [_in_frame(camera, group.positions, group.longest, group.weights) for camera in cameras]
     photos = np.flatnonzero(whole & (solid_angles(shape, cameras) > 0))
-    return _LightPhotos(photos, group.angles.sum(1)[photos], group.light.sum(1)[photos])
+    return _LightPhotos(photos, core.angles.sum(1)[photos], group.light.sum(1)[photos])
 
 
 def _deviation(group: _Candidates, measurable: float) -> float | None:
@@ -372,7 +382,7 @@ def _received_by(
     return ReceivedLight(sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit))
 
 
-def _in_frame(camera: Camera, positions: np.ndarray, widths: np.ndarray, weights: np.ndarray) -> bool:
+def _in_frame(camera: Camera, positions: np.ndarray, longest: np.ndarray, weights: np.ndarray) -> bool:
     """Return whether a photo holds a light: nearly all of the weight of its Gaussians, out to EXTENT widths."""
     if camera.projection == "equirectangular":
         return True
@@ -384,6 +394,6 @@ def _in_frame(camera: Camera, positions: np.ndarray, widths: np.ndarray, weights
         u, v = (places[:, :2] / depths[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]).T
     else:
         v, u = pixels_of_directions(places / depths[:, None], camera).T + 0.5
-    margin = EXTENT * widths * max(camera.fx, camera.fy) / depths
+    margin = EXTENT * np.linalg.norm(longest, axis=1) * max(camera.fx, camera.fy) / depths
     inside = (margin <= u) & (u <= camera.width - margin) & (margin <= v) & (v <= camera.height - margin)
     return bool(weights[before & inside].sum() >= WHOLE * weights.sum())

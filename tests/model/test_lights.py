@@ -87,17 +87,40 @@ def test_a_tube_keeps_its_length_and_faces_the_photos(radius, width):
     assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.06)
 
 
+def test_a_strip_of_few_long_gaussians_is_one_light():
+    """Gaussians as long as these reach each other, however small most others are."""
+    x = np.concatenate([np.linspace(-0.6, -0.385, 40), np.arange(-0.3, 0.5, 0.17)])
+    places = np.stack([x, np.zeros_like(x), np.full_like(x, 4)], 1)
+    scene = field(places, RADIANCE, np.where(x[:, None] < -0.38, 0.01, [0.15, 0.01, 0.01]))
+    (light,) = find_lights(scene, torch.ones(len(x)), views())
+    assert light.shape.kind == "rect" and light.shape.size[0] > 0.9 and light.shape.size[1] < 0.06
+
+
+def test_the_wall_behind_a_colored_tube_does_not_widen_it():
+    """The tube clips in all channels, and the wall in one."""
+    tube, wall = panel(1, 0.04, 0.02), panel(1, 0.6, 0.04, at=(0, 0, 4.05))
+    radiance = np.concatenate([np.tile(RADIANCE, (len(tube), 1)), np.tile([1.0, 0.1, 0.1], (len(wall), 1))])
+    scene = field(np.concatenate([tube, wall]), radiance, np.where(radiance[:, 1:2] > 1, 0.01, 0.03))
+    (light,) = find_lights(scene, torch.from_numpy(np.where(radiance[:, 1] > 1, 1.0, 0.34)).float(), views())
+    assert light.shape.size[0] == pytest.approx(1, abs=0.1) and light.shape.size[1] < 0.1
+    assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.1)
+
+
+def round_axes(places, width):
+    return np.tile(width * np.eye(3), (len(places), 1, 1))
+
+
 def test_a_window_of_uncertain_depth_is_a_rectangle_and_half_a_ball_a_sphere():
     places = panel(1.2, 0.6)
     places[:, 2] += np.random.default_rng(0).normal(0, 0.08, len(places))
-    window = fitted_shape(places, np.full(len(places), 0.05), np.ones(len(places)), np.zeros(3))
+    window = fitted_shape(places, round_axes(places, 0.05), np.ones(len(places)), np.zeros(3))
     assert window.kind == "rect" and window.size == pytest.approx((1.2, 0.6), rel=0.1)
     assert window.axes[2] == pytest.approx([0, 0, -1], abs=0.1)
-    large = fitted_shape(places, np.full(len(places), 0.2), np.ones(len(places)), np.zeros(3))
+    large = fitted_shape(places, round_axes(places, 0.2), np.ones(len(places)), np.zeros(3))
     assert large.kind == "rect" and large.axes[2] == pytest.approx([0, 0, -1], abs=0.1)
     half = ball((0, 0, 4))
     half = half[half[:, 2] < 4]
-    assert fitted_shape(half, np.full(len(half), 0.03), 4 - half[:, 2], np.zeros(3)).kind == "sphere"
+    assert fitted_shape(half, round_axes(half, 0.03), 4 - half[:, 2], np.zeros(3)).kind == "sphere"
 
 
 @pytest.mark.parametrize("offset", [(0.15, 0, 0), (0, 0.15, 0), (0, 0, 0.15)])
