@@ -26,6 +26,8 @@ _FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
 _MUCH_LIGHT = 0.5  # Share of the light in the photos from which it matters most that it is an estimate
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
+_WRONG_STOPS, _WRONG_AREA = 4.0, 0.1  # Difference, and part of a photo that has it, if its camera is wrong
+_FEW = 0.1  # Part of the photos up to which they are single ones
 
 
 class Evaluation(NamedTuple):
@@ -68,6 +70,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
         steps=trainer.total if "schedule.iterations" in trainer.config.plan.keep else None,
         posed=posed,
         misfit=any(MISFIT in note for note in scene.notes),
+        sizes={view.name: view.camera.width * view.camera.height for view in scene.train_views},
     )
 
 
@@ -83,6 +86,7 @@ def advice(
     steps: int | None = None,
     posed: str | None = None,
     misfit: bool = False,
+    sizes: Mapping[str, int] | None = None,
 ) -> list[str]:
     """Return lines of advice on a finished training; none if nothing stands out.
 
@@ -98,6 +102,7 @@ def advice(
         steps: Iterations that the user set, for the commands; None if they were planned.
         posed: Folder of the photos, if the set states their cameras; None if structure from motion found them.
         misfit: Whether a note says that the stated cameras do not fit the photos.
+        sizes: Pixels of the training photos, by their names; without them no single camera is called wrong.
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
     shorter = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
@@ -149,7 +154,9 @@ def advice(
                 f"{train_photos} photos are few: more from places between them, and nearer, would help most: {again}"
             )
     if gain < UNFINISHED and (is_long or len(points) not in (1, 2)):  # Few do not show whether blur still goes away.
-        if jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
+        if wrong := _wrong_cameras(summary, sizes or {}, again):
+            lines.append(wrong)
+        elif jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
             lines.append(jump)
         elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
             lines.append(f"{train_photos} photos are few: more from places between them would help most: {again}")
@@ -191,6 +198,27 @@ def _exposure_jump(offsets: Mapping[str, float], again: str) -> str | None:
         reason = "where exposure or sun changed"
         remedy = "state their exposure times in exposures.json beside the photos, or move them elsewhere"
     return f"{what} (stops: {names}), as {reason}: {remedy}: {again}"
+
+
+def _wrong_cameras(summary: Mapping[str, Any], sizes: Mapping[str, int], again: str) -> str | None:
+    """Return advice on single photos that differ from the scene by several stops over a large part, as no blur does.
+
+    Photos that are brighter or darker as a whole are left to their exposure.
+    """
+    areas: dict[str, float] = {}
+    offsets = summary.get("brightness_offsets") or {}
+    for region in (summary.get("unexplained") or {}).get("worst", ()):
+        photo, stops = region["photo"], abs(region["stops"])
+        if photo in sizes and stops >= max(_WRONG_STOPS, 2 * abs(offsets.get(photo, 0.0))):
+            areas[photo] = areas.get(photo, 0.0) + region["pixels"] / sizes[photo]
+    names = [photo for photo, area in areas.items() if area >= _WRONG_AREA]
+    if not 0 < len(names) <= _FEW * len(sizes):
+        return None
+    several = len(names) > 1
+    what = f"the camera{'s' if several else ''} of {first_names(names, 10)} seem{'' if several else 's'} wrong"
+    shows = "these photos alone show" if several else "this photo alone shows"
+    reason = f"{shows} another scene over {_WRONG_AREA:.0%} or more of the picture"
+    return f"{what}: {reason}; leave {'them' if several else 'it'} out: {again}"
 
 
 def _movement(unexplained: Mapping[str, Any] | None, train_photos: int, again: str) -> str | None:

@@ -119,6 +119,23 @@ def test_few_photos_and_movement():
     assert line.startswith("3 photos are few")
 
 
+def test_single_photos_that_show_another_scene_have_wrong_cameras():
+    figures, sizes = summary([28, 28, 28]), {f"p{i}": 1000 for i in range(40)}
+
+    def lines(photos, stops=7.0, pixels=80, offset=0.0, **options):
+        worst = [{"photo": f"p{i}", "stops": sign * stops, "pixels": pixels} for i in range(photos) for sign in (1, -1)]
+        found = {"unexplained": {"regions": len(worst), "worst": worst}, "brightness_offsets": {"p0": offset}}
+        return advice(Path("r"), figures | found, 40, **{"sizes": sizes} | options)
+
+    [line] = lines(2)
+    assert line.startswith("the cameras of p0, p1 seem wrong: these photos") and "leave them out" in line
+    [line] = lines(1)
+    assert line.startswith("the camera of p0 seems wrong: this photo alone shows") and "leave it out" in line
+    assert lines(2, pixels=40) == lines(2, stops=2.0) == lines(5) == lines(2, sizes={}) == []
+    [line] = lines(1, offset=5.0)
+    assert line.startswith("1 photo is brighter or darker")
+
+
 def test_a_scene_that_fits_nowhere_blames_cameras_and_overlap_and_nothing_that_moved():
     figures = summary([11, 14.9, 15.2], regions=100)
     [line] = advice(Path("r"), figures, 54, "set", posed="set/images")
