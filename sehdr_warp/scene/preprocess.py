@@ -215,7 +215,8 @@ class _Preprocessor:
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
         above = {"light_above_white": photo.above_white, "light_above_white_deviation": photo.above_white_deviation}
-        facts = {"lens": record.lens, "orientation": 1 if oriented else stored_orientation(record.image)}
+        turned = 1 if oriented else stored_orientation(record.image)
+        facts = {"lens": record.lens, "orientation": turned, "uncertain": record.uncertain}
         return View(name, photo.pixels, camera, time, split, mask, hdr, record.image, **above, **facts)
 
     def _truth(self, record: ImageRecord, lens: Lens, resample: _Resampler) -> np.ndarray | None:

@@ -33,6 +33,7 @@ class View:
         light_above_white_deviation: standard deviation of the natural logarithm of light_above_white.
         lens: of the photo, before it was undistorted; None for a view built in code.
         orientation: EXIF's, by which the pixels would have to be turned to stand upright; 1 if they do.
+        uncertain: whether structure from motion placed the camera by few points.
 
     Raises:
         ValueError: if codes have another type or shape; codes_of returns codes for encoded values.
@@ -50,6 +51,7 @@ class View:
     light_above_white_deviation: float = 0.0
     lens: "Lens | None" = None
     orientation: int = 1
+    uncertain: bool = False
 
     def __post_init__(self):
         """Check the types and shapes."""

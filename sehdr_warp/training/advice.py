@@ -1,7 +1,7 @@
 """Give advice on a finished training in plain words, each with the command to type."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -71,6 +71,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
         posed=posed,
         misfit=any(MISFIT in note for note in scene.notes),
         sizes={view.name: view.camera.width * view.camera.height for view in scene.train_views},
+        uncertain={view.name for view in scene.train_views if view.uncertain},
     )
 
 
@@ -87,6 +88,7 @@ def advice(
     posed: str | None = None,
     misfit: bool = False,
     sizes: Mapping[str, int] | None = None,
+    uncertain: Collection[str] = (),
 ) -> list[str]:
     """Return lines of advice on a finished training; none if nothing stands out.
 
@@ -103,6 +105,7 @@ def advice(
         posed: Folder of the photos, if the set states their cameras; None if structure from motion found them.
         misfit: Whether a note says that the stated cameras do not fit the photos.
         sizes: Pixels of the training photos, by their names; without them no single camera is called wrong.
+        uncertain: Names of the training photos that structure from motion placed by few points.
     """
     run, iterations = shlex.quote(str(path)), int(summary["iteration"])
     shorter = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
@@ -160,8 +163,8 @@ def advice(
             lines.append(jump)
         elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
             lines.append(f"{train_photos} photos are few: more from places between them would help most: {again}")
-        elif gain <= STILL_RISING and (movement := _movement(summary.get("unexplained"), train_photos, again)):
-            lines.append(movement)
+        elif gain <= STILL_RISING:
+            lines += _movement(summary.get("unexplained"), train_photos, uncertain, again)
     return lines
 
 
@@ -221,15 +224,21 @@ def _wrong_cameras(summary: Mapping[str, Any], sizes: Mapping[str, int], again: 
     return f"{what}: {reason}; leave {'them' if several else 'it'} out: {again}"
 
 
-def _movement(unexplained: Mapping[str, Any] | None, train_photos: int, again: str) -> str | None:
-    """Return advice on masks if photos differ from the scene in many places by more than blur explains."""
+def _movement(
+    unexplained: Mapping[str, Any] | None, train_photos: int, uncertain: Collection[str], again: str
+) -> list[str]:
+    """Return advice on masks, or on uncertain cameras, if photos differ from the scene in many places, not by blur."""
     worst: Sequence[Mapping[str, Any]] = (unexplained or {}).get("worst", ())
     if not worst or unexplained is None or unexplained["regions"] < _MANY_REGIONS * max(train_photos, 1):
-        return None
+        return []
     stops = sorted(abs(region["stops"]) for region in worst)
     if stops[len(stops) // 2] < _REGION_STOPS:
-        return None
+        return []
     photos = list(dict.fromkeys(region["photo"] for region in worst))
-    names = first_names(photos)
-    text = "photos and scene differ in many places, as where people or leaves move"
-    return f"{text} (worst in {names}): make these black in the photos' masks, masks/PHOTO.png beside them: {again}"
+    text = "photos and scene differ in many places"
+    if 2 * sum(region["photo"] in uncertain for region in worst) > len(worst):
+        names = first_names([photo for photo in photos if photo in uncertain])
+        remedy = "add photos from places between them and the others, or leave them out"
+        return [f"{text}, most in photos whose cameras are uncertain ({names}): {remedy}: {again}"]
+    remedy = "make these black in the photos' masks, masks/PHOTO.png beside them"
+    return [f"{text}, as where people or leaves move (worst in {first_names(photos)}): {remedy}: {again}"]

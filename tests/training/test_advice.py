@@ -112,6 +112,11 @@ def test_few_photos_and_movement():
     [line] = advice(Path("r"), summary([28, 28, 28], regions=100), 10)
     assert "masks/PHOTO.png" in line and "p0, p1, p2 ..." in line
     assert advice(Path("r"), summary([28, 28, 28], regions=100, stops=-1.1), 10) == []  # Blur
+    uncertain = {f"p{i}" for i in range(5, 16)}
+    [line] = advice(Path("r"), summary([28, 28, 28], regions=100), 20, uncertain=uncertain)
+    assert "cameras are uncertain (p5, p6, p7 ...): add photos" in line and "masks" not in line
+    [line] = advice(Path("r"), summary([28, 28, 28], regions=100), 20, uncertain={"p5", "p6"})
+    assert "masks/PHOTO.png" in line
     assert advice(Path("r"), summary([28, 28, 28]), 100) == []
     assert advice(Path("r"), {"iteration": 9, "metrics": []}, 6) == []
     # A set that is too small to hold photos out does not tell whether things moved.

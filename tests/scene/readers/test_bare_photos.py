@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto, PointCloud
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
@@ -192,9 +193,9 @@ def test_a_photo_whose_camera_is_uncertain_is_not_held_out(tmp_path, monkeypatch
     images = tuple(ModelImage(f"{i:05d}.png", lens, pose) for i, pose in enumerate(arc_poses(9)))
     model = SparseModel(images, PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.float32)))
     monkeypatch.setattr(bare_photos, "reconstruct", lambda *args: Reconstruction(model, 0.5, (3, 4)))
-    assert parse_dataset(tmp_path).unplaced == 0
-    records = parse_dataset(tmp_path).records
-    assert [record.view for record in records if record.split == "test"] == ["IMG_5"]
+    scene = load_scene(tmp_path, response="srgb")
+    assert [view.name for view in scene.test_views] == ["IMG_5"] and scene.unplaced == 0
+    assert [view.name for view in scene.views if view.uncertain] == ["IMG_3", "IMG_4"]
 
 
 def test_poses_of_other_programs_are_the_remedy_if_cameras_are_not_found(tmp_path):
