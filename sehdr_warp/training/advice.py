@@ -26,7 +26,7 @@ _FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
 _MUCH_LIGHT = 0.5  # Share of the light in the photos from which it matters most that it is an estimate
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
-_WRONG_STOPS, _WRONG_AREA = 4.0, 0.1  # Difference, and part of a photo that has it, if its camera is wrong
+_WRONG_STOPS, _WRONG_AREA = 2.5, 0.12  # Difference, and part of a photo that has it, if its camera is wrong
 _FEW = 0.1  # Part of the photos up to which they are single ones
 
 
@@ -156,10 +156,10 @@ def advice(
             lines.append(
                 f"{train_photos} photos are few: more from places between them, and nearer, would help most: {again}"
             )
-    if gain < UNFINISHED and (is_long or len(points) not in (1, 2)):  # Few do not show whether blur still goes away.
-        if wrong := _wrong_cameras(summary, sizes or {}, again):
-            lines.append(wrong)
-        elif jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
+    if wrong := _wrong_cameras(summary, sizes or {}, again):
+        lines.append(wrong)
+    elif gain < UNFINISHED and (is_long or len(points) not in (1, 2)):  # Few do not show whether blur still goes away.
+        if jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
             lines.append(jump)
         elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
             lines.append(f"{train_photos} photos are few: more from places between them would help most: {again}")
@@ -220,7 +220,7 @@ def _wrong_cameras(summary: Mapping[str, Any], sizes: Mapping[str, int], again: 
     several = len(names) > 1
     what = f"the camera{'s' if several else ''} of {first_names(names, 10)} seem{'' if several else 's'} wrong"
     shows = "these photos alone show" if several else "this photo alone shows"
-    reason = f"{shows} another scene over {_WRONG_AREA:.0%} or more of the picture"
+    reason = f"{shows} another scene over much of the picture"
     return f"{what}: {reason}; leave {'them' if several else 'it'} out: {again}"
 
 

@@ -136,7 +136,7 @@ def test_single_photos_that_show_another_scene_have_wrong_cameras():
     assert line.startswith("the cameras of p0, p1 seem wrong: these photos") and "leave them out" in line
     [line] = lines(1)
     assert line.startswith("the camera of p0 seems wrong: this photo alone shows") and "leave it out" in line
-    assert lines(2, pixels=40) == lines(2, stops=2.0) == lines(5) == lines(2, sizes={}) == []
+    assert lines(2, pixels=50) == lines(2, stops=2.0) == lines(5) == lines(2, sizes={}) == []
     [line] = lines(1, offset=5.0)
     assert line.startswith("1 photo is brighter or darker")
 
