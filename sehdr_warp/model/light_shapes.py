@@ -8,7 +8,9 @@ import numpy as np
 from ..scene import Camera
 
 REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
+LONG = 1.5  # Median standard deviations from which a Gaussian reaches further along its longest axis
 FLATNESS = 0.15  # Ratio of variances below which a light is flat, or thin; the half of a ball that photos show has 0.22
+LEAST_SIDE = 0.3  # Sine of the angle between a long Gaussian and the line to the cameras, below which these see its end
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +60,19 @@ def connected_groups(positions: np.ndarray, longest: np.ndarray) -> list[np.ndar
 
     Args:
         positions: [K, 3] centers.
-        longest: [K, 3] longest axes, as long as their standard deviations. Gaussians count at their centers and halfway
-            along these to both sides: few long ones make a strip.
+        longest: [K, 3] longest axes, as long as their standard deviations. Gaussians count at their centers and long
+            ones halfway along these to both sides, too: few make a strip.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    points = np.concatenate([positions, positions + longest / 2, positions - longest / 2])
-    reach = REACH * float(np.median(np.linalg.norm(longest, axis=1)))
-    pairs = KDTree(points).query_pairs(reach, output_type="ndarray") % len(positions)
+    lengths = np.linalg.norm(longest, axis=1)
+    median = float(np.median(lengths))
+    long = np.flatnonzero(lengths > LONG * median)
+    points = np.concatenate([positions, positions[long] + longest[long] / 2, positions[long] - longest[long] / 2])
+    owners = np.concatenate([np.arange(len(positions)), long, long])
+    pairs = owners[KDTree(points).query_pairs(REACH * median, output_type="ndarray")]
     links = coo_matrix((np.ones(len(pairs)), pairs.T), (len(positions), len(positions)))
     count, labels = connected_components(links, directed=False)
     return [np.flatnonzero(labels == label) for label in range(count)]
@@ -77,7 +82,7 @@ def fitted_shape(positions: np.ndarray, axes: np.ndarray, weights: np.ndarray, v
     """Return the rectangle or sphere with the weighted mean and variances of Gaussians.
 
     A rectangle emits to the side of `viewer` [3]. A thin one, such as a tube or a strip, whose Gaussians are as wide as
-    it is, faces that point.
+    it is, faces that point. If long Gaussians that point there make it thin, it is a sphere: photos show their ends.
 
     Args:
         positions: [K, 3] centers.
@@ -98,12 +103,14 @@ def fitted_shape(positions: np.ndarray, axes: np.ndarray, weights: np.ndarray, v
     else:
         values, vectors = (part[..., ::-1].T for part in np.linalg.eigh(of_centers + own))
         beyond = np.zeros(3)
-        if values[1] > FLATNESS * values[0]:
-            diameter = 2 * float(np.sqrt(values.sum()))
-            return LightShape("sphere", position, np.eye(3), (diameter, diameter))
         normal = viewer - position
+        distance = float(np.linalg.norm(normal))
         normal = normal - (normal @ vectors[0]) * vectors[0]
         length = float(np.linalg.norm(normal))
+        is_end = length < LEAST_SIDE * distance and 2 * vectors[0] @ own @ vectors[0] > values[0]
+        if values[1] > FLATNESS * values[0] or is_end:
+            diameter = 2 * float(np.sqrt(values.sum()))
+            return LightShape("sphere", position, np.eye(3), (diameter, diameter))
         normal = normal / length if length > 0 else vectors[2]
     sides = np.stack([vectors[0], np.cross(normal, vectors[0]), normal])
     width, height = (float(np.sqrt(12 * value)) for value in np.maximum(values + beyond, 0)[:2])

@@ -106,6 +106,27 @@ def test_the_wall_behind_a_colored_tube_does_not_widen_it():
     assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.1)
 
 
+@pytest.mark.parametrize("angle", [0, 0.1])
+def test_a_long_gaussian_that_points_at_the_photos_takes_no_light_away(angle):
+    places = np.concatenate([panel(0.4, 0.4), [[0, 0, 4]]])
+    widths = np.full((len(places), 3), 0.03)
+    widths[-1, 2] = 2
+    scene = field(places, RADIANCE, widths)
+    scene.gaussians.quaternions.data[-1, [0, 2]] = torch.tensor([np.cos(angle), np.sin(angle)]).float()
+    (light,) = find_lights(scene, torch.ones(len(places)), views())
+    assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.2)
+
+
+def test_equally_long_gaussians_reach_no_further_along_their_axes():
+    """Rows of them end to end are two lights, as rows side by side at this distance are."""
+    row = np.arange(0, 0.4, 0.02)
+    for along in (0, 1):
+        places = np.full((40, 3), [0, 0, 4.0])
+        places[:, along] = np.concatenate([row - 0.46, row + 0.06])
+        scene = field(places, RADIANCE, [0.04, 0.01, 0.01])
+        assert len(find_lights(scene, torch.ones(40), views())) == 2
+
+
 def round_axes(places, width):
     return np.tile(width * np.eye(3), (len(places), 1, 1))
 
