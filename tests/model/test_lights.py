@@ -114,7 +114,7 @@ def test_a_long_gaussian_that_points_at_the_photos_takes_no_light_away(angle):
     scene = field(places, RADIANCE, widths)
     scene.gaussians.quaternions.data[-1, [0, 2]] = torch.tensor([np.cos(angle), np.sin(angle)]).float()
     (light,) = find_lights(scene, torch.ones(len(places)), views())
-    assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.2)
+    assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.25)
 
 
 def test_equally_long_gaussians_reach_no_further_along_their_axes():
