@@ -285,7 +285,7 @@ def test_devices_and_pipes_are_not_read(tmp_path, read):
 
 @pytest.mark.parametrize("read", [read_json, lambda path: list(read_lines(path)), read_gaussians])
 def test_a_pointer_of_git_lfs_is_named(tmp_path, read):
-    """As a clone without LFS has them in place of large files."""
+    """A clone without LFS has pointers in place of large files."""
     (tmp_path / "a.ply").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:9970\nsize 772721\n")
     with pytest.raises(InputError, match="is a Git LFS pointer, not the file itself; fetch it with `git lfs pull`"):
         read(tmp_path / "a.ply")

@@ -134,7 +134,7 @@ def find_lights(
         # The wall behind a colored tube clips, too, in one channel: its light counts, its place does not.
         core = group.rows(np.flatnonzero(group.clipped >= CORE * np.average(group.clipped, weights=group.weights)))
         shape = fitted_shape(core.positions, core.axes, core.weights, middle)
-        light_photos = _whole_in(photos.cameras, group, core, shape)
+        light_photos = _whole_photos(photos.cameras, group, core, shape)
         if not len(light_photos.photos):
             # Every photo cuts the light off at its border. The one that shows most of it looks beyond that.
             best = int(np.argmax(group.angles.sum(1) * (solid_angles(shape, photos.cameras) > 0)))
@@ -310,7 +310,7 @@ def _candidates(field: RadianceField, clipped: Tensor, photos: _Photos) -> _Cand
     )
 
 
-def _whole_in(cameras: Sequence[Camera], group: _Candidates, core: _Candidates, shape: LightShape) -> _LightPhotos:
+def _whole_photos(cameras: Sequence[Camera], group: _Candidates, core: _Candidates, shape: LightShape) -> _LightPhotos:
     """Return the photos that do not cut the light off at their border and see its face."""
     whole = [_in_frame(camera, group.positions, group.longest, group.weights) for camera in cameras]
     photos = np.flatnonzero(whole & (solid_angles(shape, cameras) > 0))

@@ -7,6 +7,7 @@ keyframes/images/1.jpg, and corrected_cameras/ and corrected_images/ after its o
 import itertools
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +30,14 @@ _MOST_READ = 20  # Files whose content is looked at
 _REMEDY = "export the scan again, or give a folder with the photos alone"
 
 
-def find_scan(folder: Path) -> tuple[Path, Path] | None:
+class ScanFolders(NamedTuple):
+    """Folders of the photos of a scan and of the JSON files with their poses."""
+
+    photos: Path
+    poses: Path
+
+
+def find_scan(folder: Path) -> ScanFolders | None:
     """Return the folders of photos and of their poses, None if fewer photos than a training needs have one."""
     for images, cameras in (*_PLACES, (".", ".")):
         photos, poses = folder / images, folder / cameras
@@ -37,7 +45,7 @@ def find_scan(folder: Path) -> tuple[Path, Path] | None:
             files = (poses / f"{photo.stem}.json" for photo in list_images(photos, PHOTO_SUFFIXES))
             present = itertools.islice((file for file in files if file.is_file()), _MOST_READ)
             if sum(map(_states_pose, present)) >= FEWEST_PHOTOS:
-                return photos, poses
+                return ScanFolders(photos, poses)
     return None
 
 
@@ -57,9 +65,12 @@ def read_scan(folder: Path) -> DataparserOutputs:
             unusable.append(error)
     maps = [picture for picture in list_images(photos, LDR_SUFFIXES) if is_depth_map(picture)]
     notes = [*unusable_notes(unusable, len(records) + len(unusable)), *absent_note(absent, len(records))]
-    notes += ["poses are the app's: to find cameras by structure from motion, give a folder with the photos alone"]
+    notes += [
+        *maps_note(maps),
+        "poses are the app's: to find cameras by structure from motion, give a folder with the photos alone",
+    ]
     mentioned = tuple(picture.name for picture in maps)
-    return DataparserOutputs("arkit", tuple(records), notes=(*notes, *maps_note(maps)), mentioned=mentioned)
+    return DataparserOutputs("arkit", tuple(records), notes=tuple(notes), mentioned=mentioned)
 
 
 def _states_pose(file: Path) -> bool:

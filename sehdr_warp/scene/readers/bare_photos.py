@@ -109,7 +109,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
     views = [f"{photo.parent.name}_" * (stems.get(fold_name(photo.stem), 1) > 1) + photo.stem for photo in photos]
     pairs = zip(views, photos, strict=True)
     records = (ImageRecord(view, photo, UNPLACED, np.eye(4), oriented=True) for view, photo in pairs)
-    names = tuple(photo.name for photo in (*copies, *maps))
+    names = tuple(picture.name for picture in itertools.chain(copies, maps))
     return DataparserOutputs("photos", tuple(records), notes=tuple(notes), mentioned=names)
 
 
@@ -311,7 +311,7 @@ def _cameras_above(folder: Path) -> list[str]:
     above = folder.resolve().parent
     files = [above / name for name in _CAMERA_FILES if (above / name).is_file()]
     scan = find_scan(above)
-    files += [scan[1]] if scan is not None and scan[0] == folder.resolve() else []
+    files += [scan.poses] if scan is not None and scan.photos == folder.resolve() else []
     cameras = find_model(above) or next(iter(files), None)
     return (
         [] if cameras is None else [f"cameras of {cameras} are not used, cameras are found anew: give {above} for them"]

@@ -47,7 +47,7 @@ def test_poses_and_lenses_of_apps(tmp_path, app):
     ]
     for record, pose in zip(dataset.records, poses, strict=True):
         np.testing.assert_allclose(record.world_to_camera, pose, atol=1e-9)
-        assert (*record.lens.focal, *record.lens.centre) == LENS and (record.lens.width, record.lens.height) == (64, 48)
+        assert record.lens.params == LENS and (record.lens.width, record.lens.height) == (64, 48)
     assert any(note.startswith("6 pictures that are grey") for note in dataset.notes) == (app == "scanner")
     assert not any("in no view" in note for note in dataset.notes)
 
@@ -73,7 +73,7 @@ def test_a_run_with_cameras_of_its_own_keeps_them(tmp_path):
 
 
 def test_photos_of_which_two_have_a_pose_are_bare(tmp_path):
-    """As a set to which a few frames of a scan were added."""
+    """A set may have a few frames of a scan beside its photos."""
     write(tmp_path, "scanner")
     for file in sorted(tmp_path.glob("*.json"))[2:]:
         file.unlink()

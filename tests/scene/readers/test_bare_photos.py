@@ -142,7 +142,7 @@ def test_fewer_pictures_of_results_lie_beside_the_photos(tmp_path):
 
 
 def test_depth_and_confidence_beside_photos_are_not_photos(tmp_path):
-    """As the 3D Scanner App writes all data; a photo may have such a word in its name."""
+    """The 3D Scanner App writes all data so; a photo may have such a word in its name."""
     photos(tmp_path)
     Image.fromarray(pattern(16, 12, 9)).save(tmp_path / "depth_of_field.jpg")
     for i in range(9):
