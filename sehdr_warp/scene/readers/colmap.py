@@ -22,7 +22,7 @@ from ..file_names import (
 from ..images.ldr_files import PHOTO_SUFFIXES
 from ..photos import unusable_notes
 from ..unused_files import unread_kinds
-from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model
+from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model, usual_models
 
 INPUT = "input"
 """Folder of photos of 3DGS's convert.py, which writes undistorted copies to images/."""
@@ -60,7 +60,11 @@ def read_colmap(folder: Path, source: Path | None = None) -> DataparserOutputs:
     source = source or find_model(folder, anywhere=True) or folder / "sparse"
     model = registered_model(source)
     names = [image.name for image in model.images[:LOOKED_FOR]]
-    images = _images_of_model(source, names, folder) or _folder_of(names, folder)
+    images, notes = _images_of_model(source, names, folder) or _folder_of(names, folder), []
+    if images is None and (other := next((m for m in usual_models(folder) if image_folder(m.parent)), None)):
+        place, used = source.relative_to(folder), other.relative_to(folder)  # As automatic_reconstructor leaves it
+        notes.append(f"{place} has no photos; cameras are those of {used}, and photos lie beside it")
+        source, model, images = other, registered_model(other), image_folder(other.parent)
     if images is None and source == folder:
         raise InputError(folder, "is a COLMAP model without photos", "give the folder that holds it and images/")
     if images is None:
@@ -82,7 +86,7 @@ def read_colmap(folder: Path, source: Path | None = None) -> DataparserOutputs:
         raise InputError(images, problem, IMAGES_REMEDY)
     records, repeated = distinct(records)
     unusable = unusable_notes(model.unusable, len(model.images) + len(model.unusable))
-    notes = [*other_models(source), *unusable, *renamed_note(photos), *repeated]
+    notes += [*other_models(source), *unusable, *renamed_note(photos), *repeated]
     if absent:
         count = counted(
             len(absent), "image of the model is missing and was", "images of the model are missing and were"

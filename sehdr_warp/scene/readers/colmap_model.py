@@ -65,14 +65,19 @@ def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:
     its colmap/, dense/, dense/0/ and distorted/; `anywhere` also in the folder without sparse/ and in folders that are
     not sets. Of several models sparse/0, sparse/1 ... it is the one with the most images.
     """
-    names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
-    places = (folder / above / name for above in (".", "colmap", "dense", "dense/0", DISTORTED) for name in names)
-    first = next(filter(_is_model, places), None) or (_model_elsewhere(folder) if anywhere else None)
+    first = next(usual_models(folder), None) or (_model_elsewhere(folder) if anywhere else None)
     if first is None or first.name != "0":
         return first
     models = _by_number(first.parent)
     counts = {model: _image_count(model) for model in models} if len(models) > 1 else {first: 0}
     return max(counts, key=lambda model: counts[model])
+
+
+def usual_models(folder: Path) -> Iterator[Path]:
+    """Yield the models that lie where COLMAP and 3DGS put them in a folder, the most specific place first."""
+    names = ("sparse/0", "sparse", "sparse/txt", "sparse_txt", "sparse_txt/0")
+    places = (folder / above / name for above in (".", "colmap", "dense", "dense/0", DISTORTED) for name in names)
+    return filter(_is_model, places)
 
 
 def has_images(model: Path) -> bool:

@@ -283,6 +283,16 @@ def test_photos_beside_undistorted_copies(tmp_path):
     assert view.source == tmp_path / "dense" / "images" / "000.png" and view.camera.width == 64
 
 
+def test_undistorted_copies_count_where_no_photos_lie_beside_the_model(tmp_path):
+    """COLMAP's automatic_reconstructor leaves sparse/0 and dense/0 in its workspace, and the photos elsewhere."""
+    write_colmap(tmp_path)
+    shutil.copytree(tmp_path / "sparse" / "0", tmp_path / "dense" / "0" / "sparse")
+    (tmp_path / "images").rename(tmp_path / "dense" / "0" / "images")
+    scene = load(tmp_path, holdout=0)
+    assert scene.views[0].source == tmp_path / "dense" / "0" / "images" / "000.png" and len(scene.views) == 6
+    assert "sparse/0 has no photos; cameras are those of dense/0/sparse, and photos lie beside it" in scene.notes
+
+
 @pytest.mark.parametrize("copies", [False, True])
 def test_what_3dgs_convert_leaves_before_it_undistorts(tmp_path, copies):
     """Its convert.py keeps photos in input/ and their model in distorted/; images/ and sparse/0 may not be there."""
