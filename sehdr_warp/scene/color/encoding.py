@@ -1,9 +1,10 @@
 """Colors that the file of a photo states: primaries and transfer function, and their way to linear Rec.709.
 
 ICC profiles (PNG, JPEG, TIFF, WebP), PNG's cICP, gAMA and cHRM, TIFF's chromaticities, EXIF's ColorSpace. A photo whose
-file states nothing is sRGB. Display curves (gamma, sRGB, BT.709) say how a picture is to be shown, not how the camera
-turned light into codes: such photos are converted to sRGB's codes, and their response is still to be found. Linear
-light, PQ, HLG and logarithmic curves are light themselves, and leave nothing to guess.
+file states nothing is sRGB. Display curves (gamma, sRGB) say how a picture is to be shown, not how the camera turned
+light into codes: such photos are converted to sRGB's codes, and their response is still to be found. The curves of
+video cameras (BT.709, BT.601, BT.2020, SMPTE 240M) are never inverted to show a picture, so they count as sRGB's, as in
+clips, browsers and players. Linear light, PQ, HLG and logarithmic curves are light, and leave nothing to guess.
 """
 
 import re
@@ -30,6 +31,7 @@ _ADOBE_GAMMA = 563 / 256
 _LIGHT = {8: "linear light", 9: "log light", 10: "log light", 16: "PQ light", 18: "HLG light"}
 """Transfer characteristics of ITU-T H.273 that state light."""
 _UNSTATED = (0, 2, 3)  # Code points of ITU-T H.273 that state nothing
+_BT709_GAMMA = 0.50994  # 1 / 1.961, the power that FFmpeg and Apple state for the curves of video cameras
 _SAMPLES = 65_536  # Of curves: exact at all codes of 8 and 16 bits
 _PQ_WHITE = 1000.0  # cd/m2 of the code of white, BT.2100's nominal peak; what is brighter is light above white
 _SAME = 0.004  # Linear difference by which curves and primaries may differ and still be sRGB's
@@ -173,7 +175,7 @@ def encoding_of_profile(data: bytes, colors: str = "RGB") -> ColorEncoding:
     except ValueError as error:
         return ColorEncoding("ICC profile", problem=f"its ICC profile {error}")
     name = f"{profile.name} (ICC profile)"
-    if profile.cicp is not None:
+    if profile.cicp is not None and (profile.cicp[1] in _LIGHT or not profile.curves):
         return _from_cicp((*profile.cicp, 1), name)
     if profile.table is not None:
         return ColorEncoding(name, table=profile.table)
@@ -238,7 +240,7 @@ def _nclx(path: Path) -> ColorEncoding | None:
     except (InputError, KeyError):
         return None
     codes, profile = _code_points(boxes), _profile_in(boxes)
-    return _from_cicp((*codes, 1), "nclx") if codes and (profile is None or codes[1] in _LIGHT) else None
+    return encoding_of_code_points(*codes) if codes and (profile is None or codes[1] in _LIGHT) else None
 
 
 def encoding_of_boxes(boxes: Sequence[bytes]) -> ColorEncoding | None:
@@ -246,7 +248,12 @@ def encoding_of_boxes(boxes: Sequence[bytes]) -> ColorEncoding | None:
     if profile := _profile_in(boxes):
         return encoding_of_profile(profile)
     codes = _code_points(boxes)
-    return None if codes is None else _from_cicp((*codes, 1), "nclx")
+    return None if codes is None else encoding_of_code_points(*codes)
+
+
+def encoding_of_code_points(primaries: int, transfer: int) -> ColorEncoding:
+    """Return what code points of ITU-T H.273 state of full-range codes, as in a HEIF, AVIF or video file."""
+    return _from_cicp((primaries, transfer, 1), "nclx")
 
 
 def _code_points(boxes: Sequence[bytes]) -> tuple[int, int] | None:
@@ -286,23 +293,21 @@ def _h273_curve(transfer: int) -> np.ndarray:
     import colour.models as models
 
     decoders: dict[int, Callable[[np.ndarray], Any]] = {
-        4: lambda value: value**2.2,
         5: lambda value: value**2.8,
-        7: models.eotf_SMPTE240M,
         8: lambda value: value,
         9: lambda value: np.where(value > 0, 10 ** (2 * (value - 1)), 0),
         10: lambda value: np.where(value > 0, 10 ** (2.5 * (value - 1)), 0),
-        13: srgb_to_linear,
         16: lambda value: models.eotf_ST2084(value) / _PQ_WHITE,
         17: lambda value: value**2.6,
         18: models.oetf_inverse_BT2100_HLG,
     }
-    decoders |= dict.fromkeys((1, 6, 11, 12, 14, 15), models.oetf_inverse_BT709)
+    # Gamma 2.2 as in gAMA.
+    decoders |= dict.fromkeys((1, 4, 6, 7, 11, 12, 13, 14, 15), srgb_to_linear)
     return np.asarray(decoders[transfer](np.linspace(0, 1, _SAMPLES)), float)
 
 
 def _from_gama(info: dict) -> ColorEncoding | None:
-    """Return what PNG's gAMA and cHRM state; 1 / 2.2 with Rec.709's primaries is how many tools write sRGB."""
+    """Return what PNG's gAMA and cHRM state; 1 / 2.2 is how tools write sRGB, 1 / 1.961 how FFmpeg writes BT.709."""
     gamma, places = info.get("gamma"), info.get("chromaticity")
     if gamma is None and places is None:
         return None
@@ -316,11 +321,11 @@ def _from_gama(info: dict) -> ColorEncoding | None:
     if gamma is not None:
         if not 0.05 < gamma < 20:
             return ColorEncoding("gAMA", problem=f"its gAMA is {gamma:g}")
-        if abs(gamma * 2.2 - 1) > 0.02:
+        if abs(gamma * 2.2 - 1) > 0.02 and abs(gamma - _BT709_GAMMA) > 1e-3:
             curves = (np.linspace(0, 1, _SAMPLES) ** (1 / gamma),) * 3
-    chunks = [] if gamma is None else [f"gAMA {gamma:.5g}"]
-    chunks += [] if matrix is None else ["cHRM"]
-    return _simplify(" and ".join(chunks), matrix, curves)
+    if gamma is None:
+        return _simplify("cHRM, without a curve (frames of HLG and PQ clips: give the clip itself),", matrix, curves)
+    return _simplify(f"gAMA {gamma:.5g}{'' if matrix is None else ' and cHRM'}", matrix, curves)
 
 
 def _from_tiff(image: Image.Image) -> ColorEncoding | None:

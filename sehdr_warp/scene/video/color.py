@@ -7,20 +7,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...errors import InputError
+from ..color.encoding import ColorEncoding, encoding_of_code_points
+from ..color.primaries import matrix_to_rec709
 from ..types import codes_of
 
 if TYPE_CHECKING:
     from ...response import Response
 
 # Codes of ITU-T H.273: transfer characteristics, color primaries and matrix coefficients.
-_HLG, _PQ, _LOG100, _LOG316 = 18, 16, 9, 10
+_HLG, _PQ, _GAMMA_28 = 18, 16, 5
 _UNSPECIFIED = 2
 _STATED_CURVES = {_HLG: "colour:ITU-R BT.2100 HLG", _PQ: "colour:ST 2084"}
 _CURVE_NAMES = {
-    1: "Rec.709", 4: "gamma 2.2", 6: "Rec.601", 8: "linear", 13: "sRGB", 14: "Rec.2020", 15: "Rec.2020", 16: "PQ",
-    18: "HLG",
+    1: "Rec.709", 4: "gamma 2.2", 5: "gamma 2.8", 6: "Rec.601", 8: "linear", 13: "sRGB", 14: "Rec.2020", 15: "Rec.2020",
+    16: "PQ", 18: "HLG",
 }  # fmt: skip
-_PRIMARIES = {5: "ITU-R BT.470 - 625", 6: "SMPTE C", 9: "ITU-R BT.2020", 11: "DCI-P3", 12: "Display P3"}
+_PRIMARIES = {
+    5: "ITU-R BT.470 - 625", 6: "SMPTE C", 7: "SMPTE C", 9: "ITU-R BT.2020", 11: "DCI-P3", 12: "Display P3",
+}  # fmt: skip
 _LUMA = {
     1: (0.2126, 0.0722), 4: (0.30, 0.11), 5: (0.299, 0.114), 6: (0.299, 0.114), 7: (0.212, 0.087), 9: (0.2627, 0.0593),
 }  # fmt: skip
@@ -57,6 +61,7 @@ class VideoColor:
         matrix: (kr, kb) of the luma that the codes were made with; None for stored RGB.
         full_range: whether codes use the whole range.
         bits: of a sample.
+        display: way of the codes to sRGB's; None if they count as sRGB's, or have a response of their own.
     """
 
     curve: str
@@ -65,6 +70,7 @@ class VideoColor:
     matrix: tuple[float, float] | None
     full_range: bool
     bits: int
+    display: ColorEncoding | None = None
 
     def to_rec709(self) -> np.ndarray | None:
         """Return [3, 3] from the clip's linear colors to linear Rec.709, or None if they are Rec.709."""
@@ -72,9 +78,8 @@ class VideoColor:
             return None
         import colour
 
-        spaces = colour.RGB_COLOURSPACES
-        matrix = colour.matrix_RGB_to_RGB(spaces[self.primaries], spaces["ITU-R BT.709"])
-        return np.asarray(matrix, np.float64)
+        space = colour.RGB_COLOURSPACES[self.primaries]
+        return matrix_to_rec709((*map(float, np.ravel(space.primaries)), *map(float, space.whitepoint)))
 
 
 def outside_rec709(pixels: np.ndarray, color: VideoColor) -> float:
@@ -136,7 +141,8 @@ def read_color(container: Any, stream: Any, frame: Any, path: Path) -> VideoColo
         return replace(color, curve=_CURVE_NAMES[transfer], response=_STATED_CURVES[transfer], primaries=space)
     if transfer == 8:
         return replace(color, curve="linear", response="linear")
-    return replace(color, curve=_CURVE_NAMES.get(transfer, "no stated curve"))
+    display = encoding_of_code_points(_UNSPECIFIED, _GAMMA_28) if transfer == _GAMMA_28 else None
+    return replace(color, curve=_CURVE_NAMES.get(transfer, "no stated curve"), display=display)
 
 
 def _log_curve(texts: list[tuple[str, str]], transfer: int, primaries: int, bits: int) -> tuple[str, str] | None:

@@ -14,14 +14,14 @@ from ...progress import stage
 from ..cached_folder import cached_folder, file_digest
 from ..dataparser import DataparserOutputs
 from ..file_names import list_images
-from ..images.ldr_files import png16
+from ..images.ldr_files import EncodedImage, png16
 from ..readers.bare_photos import find_photos
 from .color import outside_rec709
 from .decode import Clip, codes, decode, grey, in_square_pixels, open_clip
 
 _log = logging.getLogger("sehdr_warp.scene")
 
-_VERSION = 4
+_VERSION = 5
 _STEP = 0.08
 """Movement between two frames in parts of the width: neighbors overlap by more than nine tenths."""
 _FEWEST, _MOST = 24, 240  # Frames of a clip
@@ -137,6 +137,8 @@ def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
     with stage("keeping frames", len(numbers), _log) as progress:
         for count, (number, frame) in enumerate(decode(clip, numbers), start=1):
             pixels, file = in_square_pixels(codes(frame, clip.color), clip), folder / f"frame_{number:06d}.png"
+            if clip.color.display is not None:
+                pixels = clip.color.display.convert(EncodedImage(pixels, None)).pixels
             outside.append(outside_rec709(pixels[::4, ::4], clip.color))
             if pixels.dtype == np.uint8:
                 Image.fromarray(pixels).save(file, compress_level=1)
