@@ -26,6 +26,7 @@ from .readers.colmap import model_fits, read_colmap
 from .readers.colmap_model import find_model, has_images
 from .readers.hdr_sets import is_hdr_gs, read_hdr_gs, read_hdr_nerf, read_hdr_nerf_real
 from .readers.llff import read_llff
+from .readers.meshroom import find_sfm, read_meshroom
 from .readers.opensfm import find_reconstruction, read_opensfm
 from .readers.transforms import is_transforms, read_transforms
 from .response_choice import check_response, choose_response
@@ -40,7 +41,8 @@ if TYPE_CHECKING:
 
 _MARK = "transforms_train.json"  # A file of every embedded scene
 _HOLDOUT = 8  # Every eighth view is held out, as LLFF, Mip-NeRF 360 and 3DGS do
-_WITH_TRUTH = ("colmap", "transforms", "opensfm", "arkit", "llff", "photos")  # Layouts that do not say where truth lies
+# Layouts that do not say where truth lies.
+_WITH_TRUTH = ("colmap", "transforms", "opensfm", "meshroom", "arkit", "llff", "photos")
 _FEWEST_FOR_TEST = 5  # In smaller sets no view is held out
 
 
@@ -215,7 +217,7 @@ def _folder(path: Path | str) -> Path:
 def _read(folder: Path, *, scans: bool) -> DataparserOutputs:
     """Parse by the first layout that fits, the most specific one first; a file as transforms.json.
 
-    Without `scans` photos of a scan are bare: a run may have found their cameras before poses lay beside them.
+    Without `scans` photos of a scan or of Meshroom are bare: a run may have found their cameras before poses lay there.
     """
     if folder.is_file():
         return replace(read_transforms(folder.parent, folder), folder=folder.parent)
@@ -236,6 +238,7 @@ def _read(folder: Path, *, scans: bool) -> DataparserOutputs:
         (posed is not None and model_fits(folder, posed), partial(read_colmap, source=model)),
         (find_reconstruction(folder) is not None, read_opensfm),
         (has("poses_bounds.npy"), read_llff),
+        (scans and find_sfm(folder) is not None, read_meshroom),
         (scans and find_scan(folder) is not None, read_scan),
         (model != posed, partial(read_colmap, source=model)),  # Refused: nothing else has poses.
     )

@@ -20,7 +20,7 @@ from .dataparser import ImageRecord
 from .lens import Lens
 from .shared_pixels import SharedPixels, candidate_pairs, shared_pixels
 
-POSED = ("transforms", "colmap", "llff", "opensfm", "arkit")
+POSED = ("transforms", "colmap", "llff", "opensfm", "meshroom", "arkit")
 """Layouts whose cameras are checked."""
 MISFIT = "does not fit the photos, by no convention"
 """Words of the note on cameras that no reading mends."""

@@ -85,8 +85,8 @@ class Scene:
 
     Attributes:
         name: of the set.
-        format: the layout of the data (colmap, transforms, opensfm, arkit, hdr-nerf, hdr-nerf-real, hdr-gs, llff,
-            photos, video).
+        format: the layout of the data (colmap, transforms, opensfm, meshroom, arkit, hdr-nerf, hdr-nerf-real, hdr-gs,
+            llff, photos, video).
         views: in the order of their names.
         points: [P, 3] float64 world coordinates, P may be 0.
         point_colors: [P, 3] float32 in [0, 1], encoded like photos.

@@ -40,7 +40,7 @@ _NO_PHOTOS = (*OTHER_FOLDERS, "depth", "depths", "confidence", "normals", "thumb
 # Files and folders by which a program states cameras, in lower case.
 _POSE_FILES = {
     "cameras.xml": "Metashape", "bundle.out": "Bundler", "bundle.rd.out": "Bundler", "sfm_data.json": "OpenMVG",
-    "cameras.sfm": "Meshroom", "registration.csv": "RealityCapture", "mesh_info.json": "Polycam",
+    "registration.csv": "RealityCapture", "mesh_info.json": "Polycam",
     "metadata.json": "Record3D", "arposes.txt": "ARKit", "cams": "MVSNet", "cameras_sphere.npz": "NeuS",
     "cameras.npz": "IDR", "pose": "NSVF", "camera": "Nerfies", "dslr": "ScanNet++", "groundtruth.txt": "TUM",
     "traj.txt": "Replica", "images.lst": "RealityScan", "_par.txt": "Middlebury",
@@ -49,7 +49,7 @@ _POSE_FILES = {
 _POSE_CONTENT = (
     (".csv", b"#name,x,y", "RealityScan"), (".json", b'"cameraPoseARFrame"', "3D Scanner App"),
     (".json", b'"intrinsicId"', "Meshroom"), (".json", b'"sfm_data_version"', "OpenMVG"),
-    (".nvm", b"NVM_V3", "VisualSFM"), (".out", b"Bundle file", "Bundler"), (".sfm", b'"intrinsicId"', "Meshroom"),
+    (".nvm", b"NVM_V3", "VisualSFM"), (".out", b"Bundle file", "Bundler"),
     (".xml", b"<chunk", "Metashape"), (".xmp", b"xcr:", "RealityScan"),
 )  # fmt: skip
 _MEDIA = frozenset().union(VIDEO_SUFFIXES, UNSTITCHED_SUFFIXES, HEIF_SUFFIXES)  # May be meant beside a folder of photos
@@ -57,7 +57,12 @@ _CAMERA_FOLDER = re.compile(r"\d{6}_[a-z_]|\d{3}([a-z0-9_]{5})")  # 202410__ of 
 _ALIKE = 5.0  # Degrees; 1.8 between sets of 9 photos of which one has 49 points, 8 and more if people or objects move
 _MIDDLEBURY = re.compile(r".*_par\.txt")  # templeR_par.txt
 _MOST_READ = 20  # Files of one suffix whose content is looked at
-_CAMERA_FILES = ("transforms.json", "reconstruction.json", "poses_bounds.npy")  # Beside a folder of photos
+_CAMERA_FILES = (
+    "transforms.json",
+    "reconstruction.json",
+    "poses_bounds.npy",
+    "cameras.sfm",
+)  # Beside a folder of photos
 
 
 def find_photos(folder: Path) -> DataparserOutputs:
@@ -208,7 +213,8 @@ def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> 
     if left:
         count = counted(len(left), "photo of the run is", "photos of the run are")
         notes.append(f"{count} missing: {', '.join(cameras[number].file for number in sorted(left))}")
-    return replace(dataset, records=tuple(placed), notes=(*dataset.notes, *notes)), [names[i] for i in others]
+    stated = (note for note in dataset.notes if "cameras are found anew" not in note)
+    return replace(dataset, records=tuple(placed), notes=(*stated, *notes)), [names[i] for i in others]
 
 
 def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:

@@ -68,7 +68,7 @@ def test_a_run_with_cameras_of_its_own_keeps_them(tmp_path):
     lens = Lens("SIMPLE_PINHOLE", 64, 48, (20.0, 32, 24), tmp_path)
     cameras = [PlacedPhoto(f"frame_{i:05d}.jpg", lens, i * np.eye(4), "train", 1.0) for i in range(6)]
     dataset = parse_dataset(tmp_path, cameras=cameras)
-    assert dataset.format == "photos"
+    assert dataset.format == "photos" and not any("not read" in note for note in dataset.notes)
     assert [record.world_to_camera[0, 0] for record in dataset.records] == list(range(6))
 
 

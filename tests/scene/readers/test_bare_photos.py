@@ -164,7 +164,7 @@ def test_grey_photos_of_a_conference_room_are_photos(tmp_path):
 
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
-    ("Registration.csv", "RealityCapture"), ("cameras.sfm", "Meshroom"), ("frame_00000.json", "3D Scanner App"),
+    ("Registration.csv", "RealityCapture"), ("frame_00000.json", "3D Scanner App"),
     ("dinoSR_par.txt", "Middlebury"),
 ])  # fmt: skip
 def test_poses_of_other_programs_are_named(tmp_path, file, tool):
@@ -176,7 +176,7 @@ def test_poses_of_other_programs_are_named(tmp_path, file, tool):
 
 
 @pytest.mark.parametrize("file, content, tool", [
-    ("sfm.json", '{"views": [{"intrinsicId": "1"}]}', "Meshroom"), ("a.json", '{"sfm_data_version": 1}', "OpenMVG"),
+    ("views.json", '{"views": [{"intrinsicId": "1"}]}', "Meshroom"), ("a.json", '{"sfm_data_version": 1}', "OpenMVG"),
     ("dense.nvm", "NVM_V3", "VisualSFM"), ("bundle/bundle.out", "# Bundle file v0.3", "Bundler"),
 ])  # fmt: skip
 def test_poses_of_other_programs_are_known_by_their_content(tmp_path, file, content, tool):
