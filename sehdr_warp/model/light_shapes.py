@@ -9,6 +9,7 @@ from ..scene import Camera
 
 REACH = 3.0  # Gaussians join one light if they are nearer than this many median standard deviations
 LONG = 1.5  # Median standard deviations from which a Gaussian reaches further along its longest axis
+ROUNDNESS = 0.4  # Ratio of the two larger variances below which a light is no ball, whatever its depth
 FLATNESS = 0.15  # Ratio of variances below which a light is flat, or thin; the half of a ball that photos show has 0.22
 LEAST_SIDE = 0.3  # Sine of the angle between a long Gaussian and the line to the cameras, below which these see its end
 
@@ -82,7 +83,8 @@ def fitted_shape(positions: np.ndarray, axes: np.ndarray, weights: np.ndarray, v
     """Return the rectangle or sphere with the weighted mean and variances of Gaussians.
 
     A rectangle emits to the side of `viewer` [3]. A thin one, such as a tube or a strip, whose Gaussians are as wide as
-    it is, faces that point. If long Gaussians that point there make it thin, it is a sphere: photos show their ends.
+    it is, faces that point, and so does an oblong of uncertain depth, such as a window joined with what is behind it.
+    If long Gaussians that point there make it thin, it is a sphere: photos show their ends.
 
     Args:
         positions: [K, 3] centers.
@@ -93,27 +95,27 @@ def fitted_shape(positions: np.ndarray, axes: np.ndarray, weights: np.ndarray, v
     weights = weights / weights.sum()
     position = weights @ positions
     offsets = positions - position
-    # A Gaussian reaches beyond its center on the light's face, but not across a flat one.
     of_centers, own = (offsets * weights[:, None]).T @ offsets, np.einsum("k,kia,kib->ab", weights, axes, axes)
     longest = float(weights @ (axes**2).sum(2).max(1))
     values, vectors = (part[..., ::-1].T for part in np.linalg.eigh(of_centers))
-    beyond = np.einsum("ai,ij,aj->a", vectors, own, vectors)
-    if values[2] < FLATNESS * np.sqrt(max(values[0] * values[1], 0.0)) and 2 * values[1] > longest:
+    distance = float(np.linalg.norm(viewer - position))
+    is_resolved = 2 * values[1] > longest
+    if is_resolved and values[2] < FLATNESS * np.sqrt(max(values[0] * values[1], 0.0)):
         normal = vectors[2] if vectors[2] @ (viewer - position) >= 0 else -vectors[2]
     else:
-        values, vectors = (part[..., ::-1].T for part in np.linalg.eigh(of_centers + own))
-        beyond = np.zeros(3)
-        normal = viewer - position
-        distance = float(np.linalg.norm(normal))
-        normal = normal - (normal @ vectors[0]) * vectors[0]
+        is_oblong = is_resolved and values[1] < ROUNDNESS * values[0] and 12 * values[0] < distance**2
+        if not is_oblong:
+            values, vectors = (part[..., ::-1].T for part in np.linalg.eigh(of_centers + own))
+        normal = viewer - position - ((viewer - position) @ vectors[0]) * vectors[0]
         length = float(np.linalg.norm(normal))
         is_end = length < LEAST_SIDE * distance and 2 * vectors[0] @ own @ vectors[0] > values[0]
-        if values[1] > FLATNESS * values[0] or is_end:
+        if is_end or (not is_oblong and values[1] > FLATNESS * values[0]):
             diameter = 2 * float(np.sqrt(values.sum()))
             return LightShape("sphere", position, np.eye(3), (diameter, diameter))
         normal = normal / length if length > 0 else vectors[2]
     sides = np.stack([vectors[0], np.cross(normal, vectors[0]), normal])
-    width, height = (float(np.sqrt(12 * value)) for value in np.maximum(values + beyond, 0)[:2])
+    # A Gaussian reaches beyond its center on the light's face.
+    width, height = (float(np.sqrt(12 * side @ (of_centers + own) @ side)) for side in sides[:2])
     return LightShape("rect", position, sides, (width, height))
 
 

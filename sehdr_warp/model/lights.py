@@ -21,7 +21,7 @@ CLIPPED = 0.3  # Share of the values of photos too bright for a Gaussian that cl
 BRIGHT = 0.7  # Times white, from which a Gaussian can belong to a light, and from which a photo is too bright for it
 MOST_CLIPPED = 0.1  # Share of all photos' pixels that may clip at the exposure whose white decides what a light is
 LEAST_SEEN = 0.3  # Pixels of blending weight over all views, likewise
-CORE = 0.75  # Of the share that clips of a light, from which its Gaussians count for its shape
+CORE, CORE_BRIGHT = 0.75, 0.5  # Of a light's share that clips, or brightness, from which Gaussians count for its shape
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras, if nothing hides the light from there
 MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
@@ -29,9 +29,7 @@ EXPECTED_CLIPPED = 0.9  # Of the share that clips if the scene is right, from wh
 DARKEST_CLIPPED = 0.5  # Of the share that the darkest photos show, which clips there too
 UNOBSTRUCTED = 0.5  # Of what most views show of a light: those that show less count as obstructed
 MOST_LIGHTS, MOST_VIEWS = 64, 24  # MOST_VIEWS of the longest exposures, and of those of half of these or less
-LEAST_ROWS, MOST_ROWS = 128, 724
-"""Rows of the map in which the light at a point is measured: as fine as the photos' pixels, within these bounds. In
-coarser pixels small Gaussians would no longer hide each other."""
+LEAST_ROWS, MOST_ROWS = 128, 724  # Of the map of a point's light: in coarse pixels small Gaussians hide nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +130,9 @@ def find_lights(
         if group.weights @ group.too_bright < CLIPPED * group.weights.sum():
             continue  # Darker photos alone show most of it and do not clip it, as the part of a walk in the sun.
         # The wall behind a colored tube clips, too, in one channel: its light counts, its place does not.
-        core = group.rows(np.flatnonzero(group.clipped >= CORE * np.average(group.clipped, weights=group.weights)))
+        clips = group.clipped >= CORE * np.average(group.clipped, weights=group.weights)
+        mean = np.average(group.brightness[clips], weights=group.weights[clips])
+        core = group.rows(np.flatnonzero(clips | (group.brightness >= CORE_BRIGHT * mean)))
         shape = fitted_shape(core.positions, core.axes, core.weights, middle)
         light_photos = _whole_photos(photos.cameras, group, core, shape)
         if not len(light_photos.photos):

@@ -106,6 +106,16 @@ def test_the_wall_behind_a_colored_tube_does_not_widen_it():
     assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.1)
 
 
+def test_a_panel_of_which_one_half_clips_less_is_one_light():
+    """One half clips in all channels, the other half in one, although it is nearly as bright."""
+    scene = field(panel(), RADIANCE, 0.03)
+    left = scene.gaussians.means[:, 0] < 0
+    scene.gaussians.harmonics_dc.data[left] *= 0.7
+    (light,) = find_lights(scene, torch.where(left, 0.34, 1.0), views())
+    assert light.shape.size == pytest.approx((1.25, 0.65), rel=0.1)
+    assert light.radiance == pytest.approx(0.85 * RADIANCE, rel=0.1)
+
+
 @pytest.mark.parametrize("angle", [0, 0.1])
 def test_a_long_gaussian_that_points_at_the_photos_takes_no_light_away(angle):
     places = np.concatenate([panel(0.4, 0.4), [[0, 0, 4]]])
@@ -139,6 +149,10 @@ def test_a_window_of_uncertain_depth_is_a_rectangle_and_half_a_ball_a_sphere():
     assert window.axes[2] == pytest.approx([0, 0, -1], abs=0.1)
     large = fitted_shape(places, round_axes(places, 0.2), np.ones(len(places)), np.zeros(3))
     assert large.kind == "rect" and large.axes[2] == pytest.approx([0, 0, -1], abs=0.1)
+    places[:, 2] += np.random.default_rng(1).normal(0, 0.15, len(places))  # Joined with what is behind it
+    joined = fitted_shape(places, round_axes(places, 0.05), np.ones(len(places)), np.array([1.0, 0, 0]))
+    assert joined.kind == "rect" and joined.size == pytest.approx((1.2, 0.6), rel=0.2)
+    assert joined.axes[2] == pytest.approx([0, 0, -1], abs=0.15)
     half = ball((0, 0, 4))
     half = half[half[:, 2] < 4]
     assert fitted_shape(half, round_axes(half, 0.03), 4 - half[:, 2], np.zeros(3)).kind == "sphere"

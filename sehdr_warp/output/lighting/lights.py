@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -41,6 +42,7 @@ log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".usda")
 UNSEEN = ("inpaint", "black")
 UNCERTAIN = 1.0  # Stops of deviation above which a light is called uncertain
+STRONG = 0.1  # Part of the share of the strongest uncertain light from which darker photos are to measure a light
 MOST_GAIN = 4.0  # Of a light's radiance at the lit place; more is an error of its shape, seen from the edge
 MAP_SIZE = 1024  # Pixels across of the map of what is not a light
 _STAGE = """#usda 1.0
@@ -228,12 +230,17 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
 
 def uncertain_lights(lights: Sequence[Any]) -> list[str]:
     """Return the sentence that names lights of which photos show little, and what measures them; none without them."""
-    unsure = [light.deviation is not None and light.deviation > UNCERTAIN for light in lights]
-    if not any(unsure):
+    unsure = {light_name(index): light for index, light in enumerate(lights) if (light.deviation or 0) > UNCERTAIN}
+    if not unsure:
         return []
-    names = first_names([light_name(index) for index, is_unsure in enumerate(unsure) if is_unsure], 5)
-    guess = f"{names}: uncertain by more than a factor of {2**UNCERTAIN:g} where photos clip"
-    return [f"{guess}; three photos so dark that these lights do not clip measure them"]
+    strongest = max(light.share for light in unsure.values())
+    strong = [light for light in unsure.values() if light.share >= STRONG * strongest]
+    radiance = float(np.max([light.radiance for light in strong]))
+    bound = float(np.max([light.lower_bound for light in strong]))
+    stops = max(1, math.ceil(math.log2(max(radiance, 1e-30) / max(bound, 1e-30))))
+    guess = f"{first_names(list(unsure), 5)}: uncertain by more than a factor of {2**UNCERTAIN:g} where photos clip"
+    remedy = f"three photos {stops} stop{'s' * (stops > 1)} darker than the darkest that clip there"
+    return [f"{guess}; {remedy} measure them"]
 
 
 def _describe(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:

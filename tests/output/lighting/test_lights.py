@@ -233,7 +233,7 @@ def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
     monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
     run_lights(Lights(run=run.path, world=WorldOptions(axes="scene")))
     table = capsys.readouterr().out
-    assert "(1, 0.5, 2), 0.4 x 0.2" in table and "do not clip, measure them" not in table
+    assert "(1, 0.5, 2), 0.4 x 0.2" in table and "measure them" not in table
     write_lights(run, run.path.with_name("lights.json"))
     rows = json.loads(run.path.with_name("lights.json").read_text())["lights"]
     assert [line.split()[0] for line in table.splitlines()[1:]] == [row["name"] for row in rows]
@@ -242,10 +242,13 @@ def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
     assert f"({place}), 4 x 2" in capsys.readouterr().out
 
 
-def test_uncertain_lights_are_named_with_their_remedy():
-    table = lights_table([replace(LIGHTS[0], deviation=1.2), LIGHTS[1], replace(LIGHTS[1], deviation=3.0)])
+@pytest.mark.parametrize("bound, remedy", [(1.0, "3 stops darker"), (4.0, "1 stop darker"), (9.0, "1 stop darker")])
+def test_uncertain_lights_are_named_with_their_remedy(bound, remedy):
+    """Photos so dark that the strongest lights, of up to 8, are below their white."""
+    glint = replace(LIGHTS[1], deviation=3.0, share=0.01, radiance=np.full(3, 900.0))
+    table = lights_table([replace(LIGHTS[0], deviation=1.2, lower_bound=np.full(3, bound)), LIGHTS[1], glint])
     assert table.splitlines()[-1].startswith("light_0, light_2: uncertain by more than a factor of 2")
-    assert "so dark that these lights do not clip" in table
+    assert f"three photos {remedy} than the darkest that clip there" in table
 
 
 def test_what_cannot_be_written_is_refused(tmp_path, run):
