@@ -26,7 +26,7 @@ from ..scene.exposure.compensation import (
 )
 from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
-from .plan import COMPENSATION, Decision
+from .plan import COMPENSATION, DRIFT, UNMEASURED, Decision
 
 POINTS, ROUGH_POINTS = 1500, 500  # Pixels to match for the fit, and for a rough one
 MIN_STOPS, MIN_WHITE_BALANCE, MIN_CORNER_LOSS = 0.15, 0.1, 0.15
@@ -131,13 +131,21 @@ def estimate_compensation(
     def fit(matched: MatchedPoints) -> ExposureCompensation:
         return fit_gains(views, others, matched.points, matched.visible, response)
 
-    def no_drift(matcher: Matcher, matched: MatchedPoints) -> CompensationEstimate:
-        least = f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
+    def no_drift(
+        matcher: Matcher, matched: MatchedPoints, gains: ExposureCompensation | None = None
+    ) -> CompensationEstimate:
+        choice, least = "none", f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
         reason = "do not contradict the stated times" if times_known else f"differ by less than {least}"
+        unlike = gains is not None and (gains.stops >= MIN_STOPS or gains.corner_loss >= MIN_CORNER_LOSS)
+        if gains is not None and unlike and not times_known:
+            figures = f"{gains.stops:.2f} stops between photos and {gains.corner_loss:.0%} towards the corners"
+            reason = f"differ by {figures}, and correcting that does not make them alike"
         reason = f"matched points {reason}{_reach_note(views, matched, response)}"
         if len(matched) < MIN_POINTS:
-            reason = f"{len(matched)} points match between the photos, too few to measure it"
-        return CompensationEstimate(None, Decision({}, "none", reason, COMPENSATION), matcher)
+            choice, reason = UNMEASURED, f"{len(matched)} points match between the photos, too few to measure it"
+        elif gains is not None and np.ptp(np.log2(list(gains.gains.values()))[:, 1]) >= DRIFT:
+            choice = UNMEASURED
+        return CompensationEstimate(None, Decision({}, choice, reason, COMPENSATION), matcher)
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=at_matching_size(views))
@@ -152,7 +160,7 @@ def estimate_compensation(
     compensation = fit(matched)
     components = _explanatory_components(compensation, views, matched, response, times_known)
     if not any(components):
-        return no_drift(matcher, matched)
+        return no_drift(matcher, matched, compensation)
     # Match again in photos that are already similar: more points are found.
     matcher = matcher_of(compensation.parts(**components._asdict()).normalize_photos(small, response))
     matched = match(matcher)

@@ -53,6 +53,7 @@ DROPOUT_STEPS = 250
 MAX_EXPOSURE_RATIO = 2.0**16
 """Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white."""
 COMPENSATION = "exposure-compensation"  # Name of the decision that compensation.py adds
+UNMEASURED = "not measured"  # Its choice if matched points do not show whether the exposure changed
 LEAST_OVERLAP = 0.02  # Fraction of places shown by two photos, below which poses or photos are wrong
 LEAST_CONTRAST = 1 / 255  # Standard deviation of all encoded values, below which photos show a single color
 CLIPPED = 0.002
@@ -107,8 +108,8 @@ class Plan:
         lines = [
             f"plan: {row.name}: {row.choice} ({row.reason})" for row in self.decisions if row.fields or row.always_log
         ]
-        compensated = any(row.name == COMPENSATION and row.always_log for row in self.decisions)
-        if self.facts.drift >= DRIFT and not compensated:
+        measured = any(row.name == COMPENSATION and row.choice != UNMEASURED for row in self.decisions)
+        if self.facts.drift >= DRIFT and not measured:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             lines.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
         if code := self.facts.plateau:

@@ -59,6 +59,19 @@ def test_stated_times_are_doubted_where_photos_contradict_them(device):
         assert drift is None and "do not contradict" in decision.reason
 
 
+def test_light_that_moves_over_things_is_named_and_is_no_exposure(device):
+    """A turned object shows its places in other light in each photo."""
+
+    def light_at(position, rays):
+        places = position[:2] + rays[..., :2] / rays[..., 2:] * WALL
+        turned = 0.25 * np.sin(4 * places[..., :1] + 5 * position[0] + 7 * position[1])
+        return texture(places) * 2 ** (turned + 0.3 * (position[0] > 0.2))
+
+    gains, decision = found_in(replace(photographed(light_at), exposure_times_known=False), CONFIG, LINEAR, device)
+    assert gains is None and decision.choice == "none"
+    assert "differ by 0.1" in decision.reason and "does not make them alike" in decision.reason
+
+
 def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
     """Cameras state no white balance and no vignetting: exposures are held to what they do state."""
     light = np.linspace(-0.5, 0.5, 9)[:, None] * [1, 0, -1]
