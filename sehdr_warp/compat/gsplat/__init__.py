@@ -5,14 +5,17 @@ docs/gsplat.md lists for each argument whether it is the same, different or not 
 """
 
 from .harmonics import spherical_harmonics
+from .optimizers import SelectiveAdam
 from .projection import fully_fused_projection, quat_scale_to_covar_preci
+from .relocation import compute_relocation
 from .rendering import rasterization
 from .splats import isect_offset_encode, isect_tiles
-from .strategy import DefaultStrategy, MCMCStrategy, Strategy, compute_relocation
+from .strategy import DefaultStrategy, MCMCStrategy, Strategy
 
 __all__ = [
     "DefaultStrategy",
     "MCMCStrategy",
+    "SelectiveAdam",
     "Strategy",
     "compute_relocation",
     "fully_fused_projection",

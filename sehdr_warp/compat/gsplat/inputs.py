@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ...rasterizer import spherical_harmonics
-from ...rasterizer.checks import check_tensors
-from .harmonics import check_degree
+from ...rasterizer.checks import check_tensors, integer
+from .harmonics import HIGHEST_DEGREE, check_count, evaluate
 
 UNSUPPORTED = {
     "sparse_grad": False,
@@ -73,7 +72,7 @@ class View(NamedTuple):
 
         features = [of_rows(tensor) for tensor in (self.colors, self.extra_signals) if tensor is not None]
         if self.position is not None and sh_degree is not None:
-            values = spherical_harmonics(sh_degree, features[0], of_rows(self.means), self.position)
+            values = evaluate(sh_degree, features[0], of_rows(self.means), self.position)
             features[0] = (values + 0.5).clamp_min(0.0)
         return features
 
@@ -99,7 +98,7 @@ def split_views(
     batch = tuple(means.shape[:-2]) if isinstance(means, Tensor) else ()
     color_axes: tuple[int | str, ...] = ("N", "D")
     if sh_degree is not None:
-        check_degree("sh_degree", sh_degree)
+        sh_degree = integer("sh_degree", sh_degree, 0, HIGHEST_DEGREE)
         color_axes = ("N", "K", 3)
         if isinstance(colors, Tensor) and colors.ndim == 3:  # gsplat 1.6 shares coefficients among scenes.
             colors = colors.expand(batch + colors.shape)
@@ -128,15 +127,13 @@ def split_views(
         channels = sum(
             tensor.shape[-1] for tensor, _ in features.values() if isinstance(tensor, Tensor) and tensor.ndim
         )
-        shapes["backgrounds"] = (backgrounds, (*batch, "C", channels))
+        is_shared = isinstance(backgrounds, Tensor) and backgrounds.ndim == 1  # All that gsplat 1.5 takes if packed.
+        shapes["backgrounds"] = (backgrounds, (channels,) if is_shared else (*batch, "C", channels))
     check_tensors(**shapes)
     if covars is not None:  # gsplat reads the upper triangle alone, so only that gets a gradient.
         covars = covars.flatten(-2)[..., (0, 1, 2, 1, 4, 5, 2, 5, 8)].unflatten(-1, (3, 3))
-    if colors is not None and sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
-        raise ValueError(
-            f"colors has shape {list(colors.shape)}, but sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} "
-            "coefficients"
-        )
+    if colors is not None and sh_degree is not None:
+        check_count("colors", colors, "sh_degree", sh_degree)
     if not math.prod(viewmats.shape[:-2]):
         raise ValueError(f"viewmats has shape {list(viewmats.shape)}, which has no camera")
     for name, (tensor, _) in features.items():
@@ -161,7 +158,7 @@ def split_views(
             viewmats[camera],
             Ks[camera],
             own(positions, camera),
-            own(backgrounds, camera),
+            own(backgrounds, camera if backgrounds is None or backgrounds.ndim > 1 else ()),
         )
         for camera in product(*map(range, viewmats.shape[:-2]))
     ]

@@ -60,8 +60,8 @@ def rasterization(
         quats: [..., N, 4] (w, x, y, z); None with covars.
         scales: [..., N, 3]; None with covars.
         opacities: [..., N]; above 1 they saturate as in gsplat.
-        colors: [..., N, D] or [..., C, N, D]; with sh_degree coefficients [..., N, K, 3] or [..., C, N, K, 3]. None if
-            only depths are rendered.
+        colors: [..., N, D] or [..., C, N, D]; with sh_degree coefficients [..., N, K, 3] or [..., C, N, K, 3]. None or
+            D = 0 if only depths are rendered.
         viewmats: [..., C, 4, 4] world to camera.
         Ks: [..., C, 3, 3].
         width: of the images, pixels.
@@ -70,10 +70,10 @@ def rasterization(
         far_plane: largest depth, scene units.
         radius_clip: Gaussians whose radii in pixels are not larger are left out.
         eps2d: variance in square pixels added to each 2D Gaussian.
-        sh_degree: 0 to 3, of the harmonics; None for plain colors.
+        sh_degree: 0 to 4, of the harmonics; None for plain colors.
         packed: return the visible Gaussians alone in the third result.
         tile_size: of the third result's intersections, 16 by default; rendering has its own.
-        backgrounds: [..., C, D], with extra_signals [..., C, D + E].
+        backgrounds: [..., C, D], or [D] of all cameras; with extra_signals D + E channels.
         render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED".
         sparse_grad: must be False.
         absgrad: the backward pass writes meta["means2d"].absgrad, the sums over pixels of absolute gradients.
@@ -109,7 +109,8 @@ def rasterization(
     tile_size = integer("tile_size", DEFAULT_TILE_SIZE if tile_size is None else tile_size, 1, MAX_SIDE)
     if colors is None and has_color:
         raise TypeError(f"colors is None, and render_mode {render_mode!r} renders them")
-    if not has_color:
+    is_empty = isinstance(colors, Tensor) and colors.shape[-1:] == (0,)
+    if not has_color or (has_depth and is_empty and extra_signals is None):
         colors = sh_degree = backgrounds = None
     views = split_views(
         means, quats, scales, covars, opacities, colors, extra_signals, viewmats, Ks, backgrounds, sh_degree

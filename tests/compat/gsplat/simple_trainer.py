@@ -186,7 +186,7 @@ def put_modules(scene: sw.Scene, engine: str) -> None:
         put_module("gsplat", export_splats=None)
         put_module("gsplat.compression", PngCompression=None)
         put_module("gsplat.distributed", cli=None)
-        put_module("gsplat.optimizers", SelectiveAdam=None)
+        put_module("gsplat.optimizers", SelectiveAdam=gsplat.SelectiveAdam)
         put_module("gsplat.rendering", rasterization=gsplat.rasterization)
         put_module("gsplat.strategy", DefaultStrategy=gsplat.DefaultStrategy, MCMCStrategy=gsplat.MCMCStrategy)
 

@@ -24,7 +24,7 @@ from .scenes import COUNT, HEIGHT, WIDTH, gradients, scene
         ({"eps2d": -0.1}, "eps2d -0.1 is not a number from 0"),
         ({"tile_size": 0}, "tile_size 0 is not in 1.."),
         ({"far_plane": "10"}, "far_plane is '10', expected a number"),
-        ({"sh_degree": 4}, "sh_degree 4 is not supported, expected 0 to 3"),
+        ({"sh_degree": 5}, r"sh_degree 5 is not in 0\.\.4"),
         ({"sh_degree": 2}, "colors has shape .* but sh_degree 2 needs 9 coefficients"),
         ({"backgrounds": torch.zeros(2, 4)}, "backgrounds has shape"),
         ({"rays": torch.zeros(2, 30, 40, 6)}, r"rays = a tensor of shape \[2, 30, 40, 6\] is not supported"),

@@ -1,28 +1,12 @@
 """gsplat's projection functions: cameras, covariances, culling, batches and misfits."""
 
-import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.compat import gsplat
 from sehdr_warp.compat.gsplat import fully_fused_projection, quat_scale_to_covar_preci, rasterization
-from sehdr_warp.splats.arrays import harmonic_basis
 
 from .scenes import gradients, scene
-
-HARMONICS = torch.ones(3, 3), torch.ones(3, 4, 3)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_harmonics_are_evaluated_along_directions_of_any_length(degree):
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.randn(2, 5, 3, generator=generator, dtype=torch.float64)
-    coefficients = torch.randn(2, 5, 16, 3, generator=generator, dtype=torch.float64)
-    masks = torch.rand(2, 5, generator=generator) < 0.5
-    values = gsplat.spherical_harmonics(degree, 7 * directions, coefficients, masks)
-    unit = torch.nn.functional.normalize(directions, dim=-1).numpy()
-    expected = np.einsum("...k,...kc->...c", harmonic_basis(unit, degree), coefficients[:, :, : (degree + 1) ** 2])
-    torch.testing.assert_close(values, torch.tensor(expected) * masks[..., None])
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
@@ -166,13 +150,8 @@ def test_misfits_of_intersections_are_named():
             r"scales has shape \[2, 3\]",
         ),
         (lambda: gsplat.compute_relocation(torch.ones(3), torch.ones(3, 3), torch.ones(2)), r"ratios has shape \[2\]"),
-        (lambda: gsplat.spherical_harmonics(1, torch.ones(3, 3), torch.ones(2, 4, 3)), r"coeffs has shape \[2, 4, 3\]"),
-        (lambda: gsplat.spherical_harmonics(1, torch.ones(3, 2), torch.ones(3, 4, 3)), r"dirs has shape \[3, 2\]"),
         (lambda: quat_scale_to_covar_preci(torch.ones(3, 4), torch.ones(2, 3)), r"scales has shape \[2, 3\]"),
         (lambda: gsplat.compute_relocation(torch.ones(3), torch.ones(3, 3), [1] * 3), "ratios is a list"),
-        (lambda: gsplat.spherical_harmonics("1", *HARMONICS), "degrees_to_use is '1', expected a whole number"),
-        (lambda: gsplat.spherical_harmonics(4, *HARMONICS), "degrees_to_use 4 is not supported, expected 0 to 3"),
-        (lambda: gsplat.spherical_harmonics(1, *HARMONICS, masks=[True] * 3), "masks is a list"),
     ],
 )
 def test_misfits_of_other_functions_are_named(call, message):

@@ -133,6 +133,18 @@ def test_colors_of_each_camera(device):
 
 
 @pytest.mark.parametrize("packed", [True, False])
+def test_a_background_of_all_cameras_and_depths_beside_no_channel(packed, device):
+    leaves, place = scene(device)
+    behind, options = torch.tensor([0.2, 0.4, 0.8], device=device), {"packed": packed, "render_mode": "RGB+ED"}
+    shared, _, _ = rasterization(*leaves, **place._asdict(), **options, backgrounds=behind)
+    truth, _, _ = rasterization(*leaves, **place._asdict(), **options, backgrounds=behind.expand(2, 3))
+    assert torch.equal(shared, truth)
+    nothing = leaves[4][:, :0], behind.new_zeros(2, 0)
+    depths, _, _ = rasterization(*leaves[:4], nothing[0], **place._asdict(), **options, backgrounds=nothing[1])
+    torch.testing.assert_close(depths, truth[..., 3:])
+
+
+@pytest.mark.parametrize("packed", [True, False])
 def test_extra_signals_and_depths_without_colors(packed, device):
     leaves, place = scene(device, coefficients=4)
     shapes = leaves[:4]

@@ -7,6 +7,7 @@ import torch
 
 from sehdr_warp.compat.gsplat import DefaultStrategy, MCMCStrategy, compute_relocation, rasterization
 from sehdr_warp.compat.gsplat.parameter_rows import change_rows, write_rows
+from sehdr_warp.compat.gsplat.strategy import ops
 
 from .reference_state import reference_state
 from .scenes import COUNT, scene
@@ -101,11 +102,73 @@ def test_a_training_as_gsplats_simple_trainer_makes_one(name, packed, device):
     assert counts[-1] != COUNT and (name != "mcmc" or counts[-1] == 230)
 
 
+@pytest.mark.parametrize("name", ["default", "mcmc"])
+def test_a_subclass_overrides_steps_by_gsplats_names(name):
+    """With the arguments of 1.5, which has no scenes."""
+    calls = []
+
+    class Default(DefaultStrategy):
+        def _update_state(self, params, state, info, packed=False):
+            calls.append("update")
+            super()._update_state(params, state, info, packed=packed)
+
+        def _grow_gs(self, params, optimizers, state, step):
+            calls.append("grow")
+            return super()._grow_gs(params, optimizers, state, step)
+
+        def _prune_gs(self, params, optimizers, state, step):
+            calls.append("prune")
+            return super()._prune_gs(params, optimizers, state, step)
+
+    class Mcmc(MCMCStrategy):
+        def _relocate_gs(self, params, optimizers, binoms):
+            calls.append("relocate")
+            assert [int(binoms[n, 2]) for n in (1, 2, 3, 50)] == [0, 1, 3, 1225] and binoms.shape == (51, 51)
+            return super()._relocate_gs(params, optimizers, binoms)
+
+        def _add_new_gs(self, params, optimizers, binoms):
+            calls.append("add")
+            return super()._add_new_gs(params, optimizers, binoms)
+
+    params, optimizers, place, _ = model()
+    own = [params[key] for key in ("means", "quats", "scales", "opacities", "colors")]
+    image, _, info = rasterization(*own[:2], own[2].exp(), own[3].sigmoid(), own[4], **place._asdict())
+    options = {"refine_start_iter": 0, "refine_every": 1}
+    strategy, extra = (Mcmc(**options), {"lr": 0.0}) if name == "mcmc" else (Default(**options), {"packed": True})
+    state = strategy.initialize_state()
+    strategy.step_pre_backward(params, optimizers, state, 1, info)
+    image.mean().backward()
+    strategy.step_post_backward(params, optimizers, state, 1, info, **extra)
+    assert calls == (["relocate", "add"] if name == "mcmc" else ["update", "grow", "prune"])
+
+
+def test_operations_of_strategies_alone_change_statistics_too():
+    params, optimizers, _, _ = model(count=4)
+    means, state = params["means"].detach().clone(), {"age": torch.tensor([1.0, 2.0, 3.0, 4.0])}
+    mask = torch.tensor([False, True, False, False])
+    ops.duplicate(params=params, optimizers=optimizers, state=state, mask=mask)
+    ops.remove(params=params, optimizers=optimizers, state=state, mask=torch.tensor([True, False, False, False, False]))
+    assert torch.equal(params["means"].detach(), means[[1, 2, 3, 1]]) and state["age"].tolist() == [2, 3, 4, 2]
+    ops.split(params=params, optimizers=optimizers, state=state, mask=mask, revised_opacity=True)
+    assert state["age"].tolist() == [2, 4, 2, 3, 3]
+    together = 1 - (1 - params["opacities"].detach().sigmoid()[3:]).prod()
+    assert float(together) == pytest.approx(0.5)
+    ops.reset_opa(params=params, optimizers=optimizers, state=state, value=0.1)
+    assert float(params["opacities"].sigmoid().max()) == pytest.approx(0.1)
+    ops.sample_add(params, optimizers, state, n=2)
+    assert state["age"].tolist() == [2, 4, 2, 3, 3, 0, 0]
+    params["opacities"].data[:3], state["age"] = -20.0, torch.arange(1.0, 8.0)
+    ops.relocate(params, optimizers, state, mask=params["opacities"].detach() < -9)
+    assert state["age"][:3].tolist() == [1, 2, 3] and bool((state["age"][3:] == 0).any())
+
+
 def test_relocated_gaussians_look_as_the_one_did():
     """Equation 9: n Gaussians one behind another have the opacity of the one, and its integral over a line."""
     opacities, scales = torch.tensor([0.3, 0.9, 0.6]), torch.ones(3, 3)
     ratios = torch.tensor([1, 2, 5])
     shared, sizes = compute_relocation(opacities, scales, ratios)
+    fewer, _ = compute_relocation(opacities, scales, ratios, torch.zeros(2, 2))
+    assert torch.equal(fewer[:2], shared[:2]) and float(fewer[2]) == pytest.approx(1 - math.sqrt(0.4))
     torch.testing.assert_close(1 - (1 - shared) ** ratios, opacities)
     assert float(sizes[0, 0]) == pytest.approx(1.0)
     x = torch.linspace(-12, 12, 20001, dtype=torch.float64)
