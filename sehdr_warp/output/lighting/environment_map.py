@@ -348,8 +348,14 @@ def inpainted_light(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, 
     return np.stack([map_coordinates(wrapped[..., i], at, order=1, mode="nearest") for i in range(3)], axis=2)
 
 
-def nothing_visible(run: "RenderableScene", center: MapCenter, point: np.ndarray) -> str:
-    """Return what to say if next to nothing is visible from a center, which is `point` [3] as `--at` takes it."""
+def little_visible(run: "RenderableScene", center: MapCenter, point: np.ndarray, share: float) -> str | None:
+    """Return what to say if a small share of all directions is visible from a center; None if it is not small.
+
+    The center is `point` [3] as `--at` takes it.
+    """
+    if share >= LEAST_VISIBLE:
+        text = f"from ({_place(point)}) only {100 * share:.1f} % of all directions are seen: is it within the scene?"
+        return text if share < _LEAST_COVERED else None
     remedy = "choose a point among the cameras (center, camera:NAME)" + " or a smaller --beyond" * (center.beyond > 0)
     return f"{run.path}: from ({_place(point)}) nothing of the scene is seen; {remedy}"
 
@@ -373,10 +379,10 @@ def _judge(
     `alpha`, `distance` (scene units) and `weight` (solid angles) are those of the map's pixels, [H, W].
     """
     share, place = float(weight[alpha > COVERED].sum() / weight.sum()), _place(point)
-    if share < LEAST_VISIBLE:
-        raise SehdrError(nothing_visible(run, center, point))
-    if share < _LEAST_COVERED:
-        log.warning("from (%s) only %.1f %% of all directions are seen: is it within the scene?", place, 100 * share)
+    if problem := little_visible(run, center, point, share):
+        if share < LEAST_VISIBLE:
+            raise SehdrError(problem)
+        log.warning("%s", problem)
     spread = np.linalg.norm(np.ptp([camera.position for camera in photos], axis=0)) if len(photos) > 1 else 0.0
     near = weight[(alpha > COVERED) & (distance < _NEAR * spread)].sum() / weight.sum()
     if near > 0.5:

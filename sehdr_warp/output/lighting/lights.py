@@ -24,11 +24,10 @@ from ..picture_header import provenance
 from ..world_transform import WorldTransform, world_transform
 from .environment_map import (
     COVERED,
-    LEAST_VISIBLE,
     inpainted_light,
     latlong,
+    little_visible,
     map_header,
-    nothing_visible,
     render_map,
     solid_angles,
 )
@@ -146,8 +145,9 @@ def write_lights(
         log.info(text, path.name, luminance)
     units = f"{unit}, linear Rec.709"
     received = _received_at(run, center)
-    if float(received.angles.sum()) < 4 * np.pi * LEAST_VISIBLE:
-        log.warning("%s", nothing_visible(run, center, transform.points(center.position)))
+    visible = float(received.angles.sum()) / (4 * np.pi)
+    if problem := little_visible(run, center, transform.points(center.position), visible):
+        log.warning("%s", problem)
     lights = lights_as_received(run, run.find_lights(), center, received)
     if not lights:
         text = "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest"

@@ -113,9 +113,9 @@ def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, 
     matrix = world_transform(run, "scene").matrix
     np.testing.assert_allclose(json.loads(header["sehdr:worldMatrix"]), matrix)
     filled, alpha = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
-    assert "no photo shows 94 % of all directions" in logged[0]
+    assert "no photo shows 94 % of all directions" in (line := logged[-1])
     share = float(re.search(r"sehdr:inpaintedShare = (\S+)", (tmp_path / "lights.usda").read_text())[1])
-    assert f"{100 * share:.0f} % of the map's light" in logged[0] and share > 0.5
+    assert f"{100 * share:.0f} % of the map's light" in line and share > 0.5
     write_lights(run, tmp_path / "dark.usda", axes="scene", unseen="black")
     dark = read_hdr(tmp_path / "dark_rest.exr")
     assert "sehdr:inpaintedShare = 0.0" in (tmp_path / "dark.usda").read_text()
@@ -130,6 +130,9 @@ def test_a_line_names_a_place_from_which_nothing_is_visible(tmp_path, run, monke
     monkeypatch.undo()
     write_lights(run, tmp_path / "a.json", axes="scene")
     assert "nothing of the scene" not in "\n".join(logged)
+    assert re.fullmatch(
+        r"from \(0, 0, 0\) only [1-9]\.\d % of all directions are seen: is it within the scene\?", logged[0]
+    )
     write_lights(run, tmp_path / "b.json", axes="scene", at=(-1e-17, 0, 0), beyond=1e6)
     write_lights(run, tmp_path / "c.json", axes="scene", at=(1e5, 0, 0))
     near, far = (line for line in logged if "nothing of the scene is seen" in line)
