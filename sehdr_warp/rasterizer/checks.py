@@ -118,6 +118,12 @@ def check_memory(**tensors: Tensor) -> None:
             raise TypeError(f"{name} is a {type(tensor).__name__}, which has no memory; pass a plain tensor")
 
 
+def check_channels(features: Tensor) -> None:
+    """Raise ValueError for features [N, C] without a channel."""
+    if not features.shape[-1]:
+        raise ValueError(f"features has shape {list(features.shape)}, expected [N, C] with C >= 1")
+
+
 def check_opacities(opacities: Tensor) -> None:
     """Raise ValueError for opacities on the CPU that are finite and outside of [0, 1], TypeError without memory."""
     check_memory(opacities=opacities)

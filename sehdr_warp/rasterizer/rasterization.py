@@ -18,7 +18,7 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
-from .checks import check_cameras, check_opacities, check_tensors
+from .checks import check_cameras, check_channels, check_opacities, check_tensors
 from .cuda_graphs.cache import GraphInUse, GraphPool, checked_pool, pool_for
 from .memory import oom_context
 from .projection import GaussiansAndCamera, ProjectedGaussians, Splats, project_to_camera
@@ -192,8 +192,7 @@ def check_shapes(tensors: GaussiansAndCamera, background: Any) -> None:
         intrinsics=(intrinsics, (*cameras, 4)),
         **backgrounds,
     )
-    if not features.shape[-1]:
-        raise ValueError(f"features has shape {list(features.shape)}, expected [N, C] with C >= 1")
+    check_channels(features)
     if cameras and not len(world_to_camera):
         raise ValueError("world_to_camera has no camera, expected [B, 4, 4] with B >= 1")
 

@@ -10,6 +10,7 @@ from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
 from .checks import (
     boolean,
+    check_channels,
     check_directions,
     check_opacities,
     check_position,
@@ -84,6 +85,7 @@ def rasterize_directions(
         position=(position, (3,)),
         directions=(directions, ("H", "W", 3)),
     )
+    check_channels(features)
     check_opacities(opacities)
     check_position(position)
     real("focal_length", focal_length, is_positive, "a positive number")

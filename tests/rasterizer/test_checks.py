@@ -91,11 +91,18 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
         ),
         ("directions", torch.full((2, 2, 3), NAN).double(), ValueError, "directions have lengths from nan to nan"),
         ("directions", torch.eye(3).double()[None].requires_grad_(), ValueError, r"pass directions\.detach\(\)"),
+        (
+            "features",
+            torch.ones(5, 0).double(),
+            ValueError,
+            r"features has shape \[5, 0\], expected \[N, C\] with C >= 1",
+        ),
     ],
 )
 def test_misfits_of_a_picture_of_the_sphere_are_named(name, value, kind, message):
-    tensors = random_scene(count=5).arguments[:5]
+    *tensors, features = random_scene(count=5).arguments[:5]
     arguments = {
+        "features": features,
         "position": torch.zeros(3).double(),
         "directions": torch.eye(3).double()[:2, None],
         "focal_length": 60.0,

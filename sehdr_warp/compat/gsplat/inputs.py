@@ -73,7 +73,8 @@ class View(NamedTuple):
         features = [of_rows(tensor) for tensor in (self.colors, self.extra_signals) if tensor is not None]
         if self.position is not None and sh_degree is not None:
             values = evaluate(sh_degree, features[0], of_rows(self.means), self.position)
-            features[0] = (values + 0.5).clamp_min(0.0)
+            # Clamped, -inf would be a color.
+            features[0] = torch.where(values.isneginf(), values, (values + 0.5).clamp_min(0.0))
         return features
 
 

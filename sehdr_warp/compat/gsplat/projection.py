@@ -9,6 +9,7 @@ from torch import Tensor
 from ...rasterizer.checks import check_tensors, is_not_negative, real
 from ...rasterizer.projection import FRUSTUM_MARGIN, ProjectedGaussians, project_to_camera
 from ...rasterizer.render_options import ALPHA_THRESHOLD, RenderOptions, image_size
+from ...rasterizer.torch_contract import torch_operation
 from .inputs import View, split_views
 from .splats import JoinedSplats
 
@@ -196,6 +197,7 @@ def quat_scale_to_covar_preci(
     return gram(scales) if compute_covar else None, gram(1 / scales) if compute_preci else None
 
 
+@torch_operation
 def fully_fused_projection(
     means: Tensor,
     covars: Tensor | None,

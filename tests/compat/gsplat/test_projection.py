@@ -152,8 +152,12 @@ def test_misfits_of_intersections_are_named():
         (lambda: gsplat.compute_relocation(torch.ones(3), torch.ones(3, 3), torch.ones(2)), r"ratios has shape \[2\]"),
         (lambda: quat_scale_to_covar_preci(torch.ones(3, 4), torch.ones(2, 3)), r"scales has shape \[2, 3\]"),
         (lambda: gsplat.compute_relocation(torch.ones(3), torch.ones(3, 3), [1] * 3), "ratios is a list"),
+        (
+            lambda: torch.func.grad(lambda means: fully_fused_projection(means, *(None,) * 5, 4, 3))(torch.ones(3, 3)),
+            r"fully_fused_projection\(\) does not support torch\.func",
+        ),
     ],
 )
 def test_misfits_of_other_functions_are_named(call, message):
-    with pytest.raises((ValueError, TypeError), match=message):
+    with pytest.raises((ValueError, TypeError, NotImplementedError), match=message):
         call()
