@@ -94,6 +94,19 @@ def shared() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def castle_photos(shared, tmp_path_factory) -> Path:
+    """Eleven photos at a sixth of their size, whose cameras the session's cache keeps; not to be changed."""
+    from PIL import Image
+
+    folder = tmp_path_factory.mktemp("castle") / "photos"
+    folder.mkdir()
+    for photo in (shared / "data" / "castle").glob("*.JPG"):
+        with Image.open(photo) as image:
+            image.reduce(6).save(folder / photo.name, exif=image.getexif(), quality=95)
+    return folder
+
+
 @pytest.fixture
 def logged():
     """What the package logs during a test, line by line; works also after the command line has set logging up."""

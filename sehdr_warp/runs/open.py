@@ -125,7 +125,7 @@ def _name_changed_photos(scene: Scene, run: Run, place: str) -> None:
     """Warn if photos are not those that a run was trained with, by the signatures in its scene.json."""
     from .scene_description import changed_photos, photo_signature
 
-    saved = {view["name"]: view["photo"] for view in run.folder.read_scene()["views"] if view.get("photo")}
+    saved = {view["name"]: view["photo"] for view in run.folder.read_scene()["views"]}
     found = {view.name: photo_signature(view.codes, view.mask) for view in scene.views if view.name in saved}
     if changed := changed_photos(saved, found):
         text = "%s: %d of %d photos are other pictures than in the training of %s (or have other masks): %s"

@@ -88,14 +88,13 @@ def _differing_part(saved: list[dict], current: list[dict]) -> str:
 
 
 def _split_photos(description: dict) -> dict[str, str]:
-    """Take the photos' signatures out of a description of a scene; return those there are, by the views' names.
+    """Take the photos' signatures out of a description of a scene, and return them by the views' names.
 
     Lenses are taken out, too, because cameras tell of them.
     """
     for view in description["views"]:
         view.pop("lens", None)
-    photos = {view["name"]: view.pop("photo", None) for view in description["views"]}
-    return {name: photo for name, photo in photos.items() if isinstance(photo, str)}
+    return {view["name"]: view.pop("photo") for view in description["views"]}
 
 
 def photo_signature(codes: np.ndarray, mask: np.ndarray | None = None) -> str:

@@ -202,6 +202,7 @@ class ViewValues(Values):
     split: Literal["train", "test"]
     exposure_time: Annotated[float, Field(gt=0)]
     camera: dict[str, Any]
+    photo: Text
     lens: LensValues | None = None
 
 

@@ -200,21 +200,12 @@ def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_th
             opening.in_world_of_run(replace(scene, views=(changed, *views[1:])), cameras, 4.0, "run", "photos")
 
 
-def test_the_castle_goes_on_if_its_cameras_are_found_again(tmp_path, shared, monkeypatch):
-    """Structure from motion runs twice, with another seed.
-
-    All photos, because fewer do not fix the focal length: of five, it differs by up to 2.4 % between seeds.
-    """
-    (tmp_path / "photos").mkdir()
-    for photo in (shared / "data" / "castle").glob("*.JPG"):
-        with Image.open(photo) as image:
-            image.reduce(6).save(tmp_path / "photos" / photo.name, exif=image.getexif(), quality=95)
+def test_the_castle_goes_on_if_its_cameras_are_found_again(tmp_path, castle_photos, monkeypatch):
+    """By another seed, of all photos: of five, the focal length differs by up to 2.4 % between seeds."""
     run = tmp_path / "run"
-    monkeypatch.setenv("SEHDR_CACHE", str(tmp_path / "first"))
-    assert call("train", tmp_path / "photos", "--out", run, *TRAIN.split(), "--iterations", 4) == 0
-    monkeypatch.setenv("SEHDR_CACHE", str(tmp_path / "second"))
+    assert call("train", castle_photos, "--out", run, *TRAIN.split(), "--iterations", 4) == 0
     monkeypatch.setattr(reconstruction, "SEED", reconstruction.SEED + 1)
-    scene, saved = load_scene(tmp_path / "photos", max_size=40, response="srgb"), RunFolder(run).read_cameras()
+    scene, saved = load_scene(castle_photos, max_size=40, response="srgb"), RunFolder(run).read_cameras()
     found, known = ([each.camera.world_to_camera for each in views] for views in (scene.views, saved))
     assert not np.array_equal(found, known)
     trainer = create_trainer(scene, run, resume=True, device="cpu")

@@ -1,5 +1,6 @@
 """Structure from motion: what its cache depends on, and how it places bare photos of all kinds."""
 
+import os
 import shutil
 from itertools import pairwise
 from pathlib import Path
@@ -107,34 +108,29 @@ def test_images_are_numbered_by_name_however_long_their_features_take(tmp_path):
 LOST = image_name(2)
 
 
-def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, shared, caplog):
-    """Five of the castle's photos at a quarter of their size: all placed, EXIF times kept, the second call reuses."""
-    photos = sorted((shared / "data" / "castle").glob("*.JPG"))[3:8]
-    for photo in photos:
-        with Image.open(photo) as image:
-            image.reduce(4).save(tmp_path / photo.name, exif=image.getexif(), quality=95)
+def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, castle_photos, caplog):
+    """All are placed, EXIF times kept, and the second call reuses the cameras."""
     caplog.set_level("INFO", "sehdr_warp.scene")
-    scene = load(tmp_path, max_size=200, cache=tmp_path / "cache")
-    assert scene.format == "photos" and len(scene.views) == 5 and len(scene.points) > 200
+    scene = load(castle_photos, max_size=200)
+    assert scene.format == "photos" and len(scene.views) == 11 and len(scene.points) > 200
     assert len({view.exposure_time for view in scene.views}) > 1 and scene.exposure_times_known
     assert max(view.image.shape[1] for view in scene.views) == 200 and scene.views[0].camera.width == 200
-    # Every point lies before the cameras, and most of it inside the pictures that show it.
+    # Nearly every point lies inside every picture, which has its color there, unless something hides it.
+    correlations = []
     for view in scene.views:
         x, y, z = view.camera.world_to_camera[:3, :3] @ scene.points.T + view.camera.world_to_camera[:3, 3:]
         column = view.camera.fx * x / z + view.camera.cx
         row = view.camera.fy * y / z + view.camera.cy
         inside = (z > 0) & (column > 0) & (column < view.camera.width) & (row > 0) & (row < view.camera.height)
-        assert inside.mean() > 0.4
+        assert inside.mean() > 0.8
         colors = view.image[row[inside].astype(int), column[inside].astype(int)]
-        assert np.corrcoef(colors.ravel(), scene.point_colors[inside].ravel())[0, 1] > 0.5
+        correlations.append(np.corrcoef(colors.ravel(), scene.point_colors[inside].ravel())[0, 1])
+    assert min(correlations) > 0.45 and np.mean(correlations) > 0.7  # With the next camera 0.37 and 0.18
     caplog.clear()
-    (tmp_path / "moved").mkdir()
-    for photo in tmp_path.glob("*.JPG"):
-        shutil.copy(photo, tmp_path / "moved")
-    again = load(tmp_path / "moved", max_size=100, cache=tmp_path / "cache")
+    again = load(shutil.copytree(castle_photos, tmp_path / "moved"), max_size=100)
     assert "cached" in caplog.messages[0]
     np.testing.assert_array_equal(again.points, scene.points)
-    assert not [entry for entry in (tmp_path / "cache").iterdir() if entry.name.startswith("sehdr-sfm-")]
+    assert not list(Path(os.environ["SEHDR_CACHE"]).glob("sehdr-sfm-*"))
 
 
 def test_turned_photos_are_placed_upright(tmp_path, shared):
