@@ -35,7 +35,7 @@ def test_gains_before_a_resume_do_not_count():
 
 def test_light_that_is_an_estimate_comes_first():
     first, second = advice(Path("r"), summary([20, 22, 23, 24]) | {"estimated_light": 0.754}, 50)
-    assert first.startswith("75% of the light is an estimate") and first.endswith("sehdr-warp lights r")
+    assert first.startswith("75% of the light is an estimate") and first.endswith("how many stops: sehdr-warp lights r")
     assert "more steps help" in second
     assert len(advice(Path("r"), summary([20, 22, 23, 24]) | {"estimated_light": 0.4}, 50)) == 1
 
