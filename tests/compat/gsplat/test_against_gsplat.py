@@ -147,7 +147,7 @@ def test_mcmc_changes_gaussians_and_moments_as_gsplats_does(monkeypatch):
     monkeypatch.setattr(operations, "_multinomial_sample", draw)
     monkeypatch.setattr(operations, "compute_relocation", relocation_by_sums)
     monkeypatch.setattr(operations, "quat_scale_to_covar_preci", reference._quat_scale_to_covar_preci)
-    monkeypatch.setattr("sehdr_warp.compat.gsplat.strategy._draw", draw)
+    monkeypatch.setattr("sehdr_warp.compat.gsplat.strategy.ops._draw", draw)
     results = []
     for module in (gsplat, ours):
         torch.manual_seed(0)

@@ -62,10 +62,12 @@ class MCMCStrategy(Strategy):
         lr: learning rate of the means. scene: a gsplat 1.6 Scene, whose methods on_relocate() and the like are called.
         """
         if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
-            inputs = params, optimizers, state.get("binoms")
+            binoms = state.get("binoms")
+            if binoms is not None:
+                binoms = state["binoms"] = binoms.to(params["means"].device)
             options = {} if scene is None else {"scene": scene}
-            moved = self._relocate_gs(*inputs, **options)
-            added = self._add_new_gs(*inputs, **options)
+            moved = self._relocate_gs(params, optimizers, binoms, **options)
+            added = self._add_new_gs(params, optimizers, binoms, **options)
             if self.verbose:
                 print(f"Step {step}: {moved} Gaussians moved, {added} added; {len(params['means'])} now.")
         if self.noise_injection_stop_iter < 0 or step < self.noise_injection_stop_iter:
