@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".usda")
 UNSEEN = ("inpaint", "black")
-UNCERTAIN = 1.0  # Stops of deviation above which a light is called uncertain
+UNCERTAIN = 0.5  # Stops of deviation above which a light is called uncertain
 STRONG = 0.1  # Part of the share of the strongest uncertain light from which darker photos are to measure a light
 MOST_GAIN = 4.0  # Of a light's radiance at the lit place; more is an error of its shape, seen from the edge
 MAP_SIZE = 1024  # Pixels across of the map of what is not a light
@@ -238,7 +238,7 @@ def uncertain_lights(lights: Sequence[Any]) -> list[str]:
     radiance = float(np.max([light.radiance for light in strong]))
     bound = float(np.max([light.lower_bound for light in strong]))
     stops = max(1, math.ceil(math.log2(max(radiance, 1e-30) / max(bound, 1e-30))))
-    guess = f"{first_names(list(unsure), 5)}: uncertain by more than a factor of {2**UNCERTAIN:g} where photos clip"
+    guess = f"{first_names(list(unsure), 5)}: uncertain by more than {UNCERTAIN:g} stops where photos clip"
     remedy = f"three photos {stops} stop{'s' * (stops > 1)} darker than the darkest that clip there"
     return [f"{guess}; {remedy} measure them"]
 

@@ -28,7 +28,7 @@ from .test_environment_map import lamps
 PANEL = LightShape("rect", np.array([1.0, 0.5, 2.0]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (0.4, 0.2))
 BALL = LightShape("sphere", np.array([0.0, 0.0, 3.0]), np.eye(3), (0.3, 0.3))
 LIGHTS = [
-    Light(PANEL, np.array([8.0, 4.0, 2.0]), np.ones(3), 0.7, 0.5, torch.tensor([0])),
+    Light(PANEL, np.array([8.0, 4.0, 2.0]), np.ones(3), 0.4, 0.5, torch.tensor([0])),
     Light(BALL, np.array([3.0, 3.0, 3.0]), np.ones(3), None, 0.2, torch.tensor([1, 2])),
 ]
 
@@ -59,7 +59,7 @@ def test_json_has_every_figure(tmp_path, run):
     first, second = lights_file["lights"]
     assert first["position"] == [1.0, 0.5, 2.0] and first["size"] == [0.4, 0.2] and first["shape"] == "rect"
     assert first["radiance"] == pytest.approx([8, 4, 2]) and first["lower_bound"] == [1, 1, 1]
-    assert first["deviation_stops"] == 0.7 and second["deviation_stops"] is None
+    assert first["deviation_stops"] == 0.4 and second["deviation_stops"] is None
     assert lights_file["lit_place"] == pytest.approx([0, 0, 0])
     assert (first["share_of_light"], second["shape"]) == (0.5, "sphere") and "Rec.709" in lights_file["units"]
 
@@ -249,8 +249,8 @@ def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
 def test_uncertain_lights_are_named_with_their_remedy(bound, remedy):
     """Photos so dark that the strongest lights, of up to 8, are below their white."""
     glint = replace(LIGHTS[1], deviation=3.0, share=0.01, radiance=np.full(3, 900.0))
-    table = lights_table([replace(LIGHTS[0], deviation=1.2, lower_bound=np.full(3, bound)), LIGHTS[1], glint])
-    assert table.splitlines()[-1].startswith("light_0, light_2: uncertain by more than a factor of 2")
+    table = lights_table([replace(LIGHTS[0], deviation=0.6, lower_bound=np.full(3, bound)), LIGHTS[1], glint])
+    assert table.splitlines()[-1].startswith("light_0, light_2: uncertain by more than 0.5 stops")
     assert f"three photos {remedy} than the darkest that clip there" in table
 
 
