@@ -239,7 +239,7 @@ def uncertain_lights(lights: Sequence[Any]) -> list[str]:
     bound = float(np.max([light.lower_bound for light in strong]))
     stops = max(1, math.ceil(math.log2(max(radiance, 1e-30) / max(bound, 1e-30))))
     guess = f"{first_names(list(unsure), 5)}: uncertain by more than {UNCERTAIN:g} stops where photos clip"
-    remedy = f"three photos {stops} stop{'s' * (stops > 1)} darker than the darkest that clip there"
+    remedy = f"three photos about {stops} stop{'s' * (stops > 1)} darker than the darkest that clip there"
     return [f"{guess}; {remedy} measure them"]
 
 

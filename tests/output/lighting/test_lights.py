@@ -251,7 +251,7 @@ def test_uncertain_lights_are_named_with_their_remedy(bound, remedy):
     glint = replace(LIGHTS[1], deviation=3.0, share=0.01, radiance=np.full(3, 900.0))
     table = lights_table([replace(LIGHTS[0], deviation=0.6, lower_bound=np.full(3, bound)), LIGHTS[1], glint])
     assert table.splitlines()[-1].startswith("light_0, light_2: uncertain by more than 0.5 stops")
-    assert f"three photos {remedy} than the darkest that clip there" in table
+    assert f"three photos about {remedy} than the darkest that clip there" in table
 
 
 def test_what_cannot_be_written_is_refused(tmp_path, run):
