@@ -5,6 +5,7 @@ Matching all features of all pairs takes most of the time of structure from moti
 
 import itertools
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,19 @@ def pairs_with(names: set[str], database: Path) -> list[tuple[str, str]]:
     with pycolmap.Database.open(database) as opened:
         images = sorted(image.name for image in opened.read_all_images())
     return [pair for pair in itertools.combinations(images, 2) if names.intersection(pair)]
+
+
+def remove_matches(pairs: Sequence[tuple[str, str]], database: Path) -> None:
+    """Remove the matches between pairs of images by their names, because COLMAP passes over pairs that have some."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        for first, second in pairs:
+            if opened.exists_matches(numbers[first], numbers[second]):
+                opened.delete_matches(numbers[first], numbers[second])
+            if opened.exists_two_view_geometry(numbers[first], numbers[second]):
+                opened.delete_two_view_geometry(numbers[first], numbers[second])
 
 
 def _coarse_features(database: Path) -> tuple[list[str], list[np.ndarray]]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.scene.color.primaries import linear_to_srgb, srgb_to_linear
 from sehdr_warp.scene.dataparser import PointCloud
 from sehdr_warp.scene.lens import Lens
@@ -260,6 +261,33 @@ def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypa
     again = reconstruct(photos, tmp_path / "again")
     assert "matching pairs of photos that could not be placed: 4" in caplog.messages
     assert LOST in {image.name for image in again.model.images} and len(again.model.images) == 5
+
+
+def test_more_is_matched_of_photos_without_a_place_before_the_second_try(tmp_path, shared, monkeypatch):
+    """Photos far apart share tens of matches, too few to be placed by, and more along the epipolar lines of these."""
+    pycolmap = pytest.importorskip("pycolmap")
+    for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[3:6]:
+        with Image.open(photo) as image:
+            image.reduce(6).save(tmp_path / photo.name, quality=95)
+    counts = []
+
+    def count_matches(database):
+        with pycolmap.Database.open(database) as opened:
+            counts.append(
+                [len(opened.read_two_view_geometry(*pair).inlier_matches) for pair in ((1, 2), (1, 3), (2, 3))]
+            )
+
+    def run_mapper(database, *_, before_again):
+        count_matches(database)
+        before_again({sfm.image_name(0), sfm.image_name(1)})
+        count_matches(database)
+        raise InputError(tmp_path, "is not placed", "stop here")
+
+    monkeypatch.setattr(sfm, "run_mapper", run_mapper)
+    with pytest.raises(InputError, match="is not placed"):
+        reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
+    (placed, *before), (placed_again, *after) = counts
+    assert placed_again == placed and np.greater(after, 1.1 * np.array(before)).all()
 
 
 def test_poor_placement_is_named_with_its_photos():
