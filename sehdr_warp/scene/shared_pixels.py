@@ -9,7 +9,7 @@ from PIL import Image
 
 from ..errors import InputError
 from .dataparser import ImageRecord
-from .images.ldr_files import PILLOW_ERRORS, open_image, orientation_of, turn_upright
+from .images.ldr_files import PILLOW_ERRORS, open_image, orientation_of, turn_of_loaded, turn_upright
 from .lens import Lens
 from .masks import read_mask
 from .photos import fitted_lens
@@ -110,10 +110,13 @@ def _small_photo(record: ImageRecord) -> tuple[Lens, np.ndarray, np.ndarray] | N
         with open_image(record.image) as image:
             if image.mode not in ("L", "RGB", "RGBA", "P"):
                 return None
-            turn = orientation_of(image) if oriented else 1
+            stated = orientation_of(image)
+            turned = oriented and stated in (5, 6, 7, 8)
+            image.draft("L", (lens.height, lens.width) if turned else (lens.width, lens.height))
+            grey = image.convert("RGB").convert("L")
+            turn = turn_of_loaded(image, stated, oriented=oriented)
             size = (lens.height, lens.width) if turn in (5, 6, 7, 8) else (lens.width, lens.height)
-            image.draft("L", size)
-            grey = image.convert("RGB").convert("L").resize(size, Image.Resampling.BOX)
+            grey = grey.resize(size, Image.Resampling.BOX)
         mask = np.ones((lens.height, lens.width), bool)
         if record.mask is not None:
             stored = Image.fromarray(read_mask(record.mask, oriented=oriented))

@@ -167,6 +167,17 @@ def test_of_two_lenses_none_is_changed(tmp_path, photos, views):
     assert focal == pytest.approx([2 * right] * 11 + [right] * 3)
 
 
+def test_tiff_photos_are_compared_as_they_are_stored(tmp_path, photos, views):
+    """Pillow turns a TIFF with an orientation, which a square camera does not tell to be followed."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    (tmp_path / "tiff").mkdir()
+    for photo in photos.iterdir():
+        Image.open(photo).save(tmp_path / "tiff" / photo.with_suffix(".tif").name, exif=exif)
+    folder = write_transforms(tmp_path / "set", tmp_path / "tiff", views, lambda pose: np.linalg.inv(pose) @ FLIP)
+    check(folder, views, None)
+
+
 def test_photos_of_one_place_are_not_compared():
     """Pairs of one bracket fit any poses."""
     thrice = [record for record in parse_dataset("embedded").records[:14] for _ in range(3)]

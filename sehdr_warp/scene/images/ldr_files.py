@@ -113,8 +113,9 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
             with (
                 silent_stderr() if image.format == "TIFF" else nullcontext()
             ):  # libtiff prints of what it cannot decode.
+                stated = orientation_of(image) if image.format == "TIFF" else 1
                 pixels, alpha = _decode(image, path)
-            turn = orientation_of(image) if oriented else 1
+            turn = turn_of_loaded(image, stated, oriented=oriented)
         except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
     return EncodedImage(turn_upright(pixels, turn), None if alpha is None else turn_upright(alpha, turn))
@@ -154,6 +155,9 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
         finally:
             Image.MAX_IMAGE_PIXELS = limit
     try:
+        if image.format == "TIFF":
+            # Pillow turns a TIFF upright when it loads it, and states that size before, by which it misreads grey.
+            image._size = tuple(image.tag_v2[tag] for tag in (256, 257))  # pyright: ignore[reportAttributeAccessIssue]
         check_size(path, *image.size)
         if several:
             raise InputError(path, "holds several pictures, pages or an animation", "save the one that counts")
@@ -267,6 +271,7 @@ def _is_grey_alpha_of_16_bits(image: ImageFile.ImageFile) -> bool:
 
 def _convert(image: Image.Image, mode: str) -> np.ndarray:
     """Convert an image to [H, W, C] uint8 in bands, because Pillow copies what it converts."""
+    image.load()  # It may turn the image.
     width, height = image.size
     codes = np.empty((height, width, len(mode)), np.uint8)
     for top in range(0, height, _BAND_ROWS):
@@ -315,6 +320,17 @@ def orientation_of(image: Image.Image) -> int:
         return exif_of(image).get(0x0112, 1)
     except PILLOW_ERRORS:
         return 1
+
+
+def turn_of_loaded(image: Image.Image, stated: int, *, oriented: bool) -> int:
+    """Return the turn, as of turn_upright(), of loaded pixels to upright ones if `oriented`, else to those in the file.
+
+    `stated` is orientation_of() a TIFF before: Pillow turns its pixels, mostly, and then takes out the orientation.
+    """
+    left = orientation_of(image)
+    if oriented:
+        return left
+    return {6: 8, 8: 6}.get(stated, stated) if image.format == "TIFF" and left == 1 else 1
 
 
 def png16(codes: np.ndarray, exif: bytes | None = None, level: int = -1) -> bytes:

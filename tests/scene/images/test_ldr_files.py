@@ -10,7 +10,7 @@ from PIL import Image, ImageOps
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.images.exif import are_camera_jpegs
 from sehdr_warp.scene.images.hdr_files import hdr_size, read_hdr
-from sehdr_warp.scene.images.ldr_files import exif_of, has_16_bits, image_sizes, open_image, read_ldr
+from sehdr_warp.scene.images.ldr_files import exif_of, has_16_bits, image_sizes, open_image, read_ldr, turn_upright
 from sehdr_warp.scene.masks import read_mask
 from sehdr_warp.scene.photos import photo_sizes
 from tests.make_scenes import png_of
@@ -59,6 +59,24 @@ def test_orientation_is_pillows(tmp_path, orientation):
     expected = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "o.png")))
     np.testing.assert_array_equal(read_ldr(tmp_path / "o.png", oriented=True).pixels, expected)
     assert image_sizes(tmp_path / "o.png")[1] == expected.shape[1::-1]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", ["rgb", "rgb 16", "grey", "grey 16", "planes 16"])
+def test_tiff_is_read_as_stored_and_upright(tmp_path, kind, orientation):
+    """Pillow turns a TIFF when it loads the pixels; raw grey it misreads."""
+    name, _, deep = kind.partition(" ")
+    codes = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8).astype(np.uint16 if deep else np.uint8)
+    stored = {"grey": codes[..., 0], "planes": codes.transpose(2, 0, 1)}.get(name, codes)
+    options = {"grey": {"photometric": "minisblack"}, "planes": {"photometric": "rgb", "planarconfig": "separate"}}
+    tags = [(274, "H", 1, orientation, True)]
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "o.tif", stored, extratags=tags, **options.get(name, {"photometric": "rgb"}))
+    expected = np.repeat(codes[..., :1], 3, 2) if name == "grey" else codes
+    np.testing.assert_array_equal(read_ldr(tmp_path / "o.tif").pixels, expected)
+    upright = turn_upright(expected, orientation)
+    np.testing.assert_array_equal(read_ldr(tmp_path / "o.tif", oriented=True).pixels, upright)
+    assert image_sizes(tmp_path / "o.tif") == ((7, 5), upright.shape[1::-1])
 
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"
