@@ -1,5 +1,6 @@
 """Trainings on photos whose exposure drifts unsaid."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -64,12 +65,13 @@ def test_light_that_moves_over_things_is_named_and_is_no_exposure(device):
 
     def light_at(position, rays):
         places = position[:2] + rays[..., :2] / rays[..., 2:] * WALL
-        turned = 0.25 * np.sin(4 * places[..., :1] + 5 * position[0] + 7 * position[1])
-        return texture(places) * 2 ** (turned + 0.3 * (position[0] > 0.2))
+        turned = 0.4 * np.sin(4 * places[..., :1] + 5 * position[0] + 7 * position[1])
+        return texture(places) * 2 ** (turned + 0.42 * (position[0] > 0.2))
 
     gains, decision = found_in(replace(photographed(light_at), exposure_times_known=False), CONFIG, LINEAR, device)
     assert gains is None and decision.choice == "none"
-    assert "differ by 0.1" in decision.reason and "does not make them alike" in decision.reason
+    assert re.search(r"differ by 0\.[12]\d stops", decision.reason), decision.reason
+    assert "does not make them alike" in decision.reason
 
 
 def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
