@@ -67,8 +67,8 @@ are of clipped values, in stops; *light* is the median error of their sum, log2.
 | --- | -: | -: | -: | -: | -: | -: | -: |
 {brackets}
 
-A light's color is hardly known: the estimate has {slope:.2f} of the stops between red and blue, as its correlation with
-the truth, {correlation:.2f}, calls for. So lights that clip in all channels come out pale.
+A light's color is hardly known: the estimate has {slope:.2f} of the stops between red and blue (correlation with the
+truth {correlation:.2f}). So lights that clip in all channels come out pale.
 """
 
 

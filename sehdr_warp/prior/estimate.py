@@ -22,11 +22,11 @@ VARIANCE_SHARE = 0.5
 """Share of the variance that the expected light counts: exp(mean + share * deviation^2 / 2), of natural logarithms.
 With 1 it is the mean of a log-normal value, whose rare large errors light a scene far too brightly; with 0 it is the
 median, below the mean light of small lamps. In the rooms of docs/reports/quality.md where much clips, at exposures 2 to
-4, irradiance is off by 22 % in the mean with 0.5 and by 25 % with 1, but 15 lights are lost in place of 12."""
+4, irradiance was off by 22 % in the mean with 0.5 and by 25 % with 1, but 15 lights were lost in place of 12."""
 LARGE_DEVIATION_POWER = 1.5
-"""Power by which deviations over one stop are widened where they say how sure light is. Per clipped region, of rooms
-and of panoramas that no training used, 68 % of the estimates are off by at most 1.2, 1.6, 2.1 and 3.3 stops where the
-network states 1.1, 1.4, 1.7 and 2.15."""
+"""Power by which deviations over one stop are widened where they say how sure light is. Per region, in photos of
+panoramas that no training used, 68 % of the estimates are off by at most 1.1, 1.5, 1.9 and 3.3 stops where the network
+states 1.1, 1.4, 1.7 and 2.2."""
 ESTIMATE_POWER = 0.5
 """Power of the expected light to which the estimates of several photos weigh. Photos disagree about a lamp by a factor,
 which is about log-normal with a deviation s. Logarithms that weigh by the root of the light then have the mean + s^2/2,
