@@ -19,6 +19,8 @@ class SelectiveAdam(torch.optim.Adam):
     @torch.no_grad()
     def step(self, visibility: Tensor) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Change the rows that visibility [N] marks, and their moments; the others stay."""
+        if not isinstance(visibility, Tensor):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise TypeError(f"visibility is a {type(visibility).__name__}, expected a tensor [N]")
         for group in self.param_groups:
             if len(group["params"]) != 1:
                 raise ValueError(f"a group has {len(group['params'])} parameters, expected 1")

@@ -28,3 +28,5 @@ def test_what_does_not_fit_is_named():
     parameters[0].grad = torch.ones(4)
     with pytest.raises(ValueError, match=r"visibility has shape \[3\], but a parameter \[4\]"):
         SelectiveAdam(parameters[:1], eps=1e-8, betas=(0.9, 0.99)).step(torch.ones(3))
+    with pytest.raises(TypeError, match="visibility is a list, expected a tensor"):
+        SelectiveAdam(parameters[:1], eps=1e-8, betas=(0.9, 0.99)).step([True] * 4)

@@ -154,12 +154,27 @@ def test_operations_of_strategies_alone_change_statistics_too():
     together = 1 - (1 - params["opacities"].detach().sigmoid()[3:]).prod()
     assert float(together) == pytest.approx(0.5)
     ops.reset_opa(params=params, optimizers=optimizers, state=state, value=0.1)
-    assert float(params["opacities"].sigmoid().max()) == pytest.approx(0.1)
+    assert float(params["opacities"].detach().sigmoid().max()) == pytest.approx(0.1)
     ops.sample_add(params, optimizers, state, n=2)
     assert state["age"].tolist() == [2, 4, 2, 3, 3, 0, 0]
-    params["opacities"].data[:3], state["age"] = -20.0, torch.arange(1.0, 8.0)
+    params["opacities"].data[:3], state["age"], state["binoms"] = -20.0, torch.arange(1.0, 8.0), torch.ones(5, 5)
     ops.relocate(params, optimizers, state, mask=params["opacities"].detach() < -9)
+    assert bool(state["binoms"].all())
     assert state["age"][:3].tolist() == [1, 2, 3] and bool((state["age"][3:] == 0).any())
+
+
+@pytest.mark.parametrize("operation", [ops.duplicate, ops.split, ops.remove, ops.relocate])
+def test_what_is_no_mask_or_opacity_is_named(operation):
+    params, optimizers, _, _ = model(count=4)
+    for mask, message in (
+        (torch.tensor([1, 0, 0, 0]), r"mask is torch\.int64, expected torch\.bool"),
+        (torch.ones(3, dtype=torch.bool), r"mask has shape \[3\], expected \[4\]"),
+        ([True] * 4, "mask is a list"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            operation(params, optimizers, {}, mask)
+    with pytest.raises(ValueError, match="value 1.2 is not above 0 and at most 1"):
+        ops.reset_opa(params, optimizers, {}, 1.2)
 
 
 def test_relocated_gaussians_look_as_the_one_did():

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ....rasterizer.checks import check_shape, real
 from ..parameter_rows import Optimizers, Parameters, change_rows, write_rows
 from ..projection import rotation_matrices
 from ..relocation import compute_relocation
@@ -20,6 +21,7 @@ SPLIT_SHRINK = 1.6  # Both parts of a split Gaussian are this many times smaller
 @torch.no_grad()
 def duplicate(params: Parameters, optimizers: Optimizers, state: State, mask: Tensor, scene: Any = None) -> None:
     """Append a copy of each Gaussian of a mask [N]."""
+    _check_mask(params, mask)
     rows = mask.nonzero()[:, 0]
     copies = {name: value.detach()[rows] for name, value in params.items()}
     change_rows(params, optimizers, state, torch.ones_like(mask), copies, rows)
@@ -40,6 +42,7 @@ def split(
 
     revised_opacity: both together are as opaque as it was (Rota Bulo et al. 2024).
     """
+    _check_mask(params, mask)
     rows, others = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
     parts = {name: torch.cat([value.detach()[rows]] * 2) for name, value in params.items()}
     sizes = parts["scales"].exp()
@@ -56,6 +59,7 @@ def split(
 @torch.no_grad()
 def remove(params: Parameters, optimizers: Optimizers, state: State, mask: Tensor, scene: Any = None) -> None:
     """Remove the Gaussians of a mask [N]."""
+    _check_mask(params, mask)
     change_rows(params, optimizers, state, ~mask)
     if scene is not None:
         scene.on_remove(mask)
@@ -64,6 +68,7 @@ def remove(params: Parameters, optimizers: Optimizers, state: State, mask: Tenso
 @torch.no_grad()
 def reset_opa(params: Parameters, optimizers: Optimizers, state: State, value: float) -> None:
     """Lower opacities to at most `value`."""
+    real("value", value, lambda number: 0 < number <= 1, "above 0 and at most 1; a strategy's is twice its prune_opa")
     highest = torch.logit(torch.tensor(value, dtype=torch.float64)).item()
     write_rows(params, optimizers, {"opacities": params["opacities"].clamp(max=highest)})
 
@@ -82,6 +87,7 @@ def relocate(
 
     binoms: as of compute_relocation(). min_opacity: least opacity of those that share.
     """
+    _check_mask(params, mask)
     targets, others = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
     if not len(targets) or not len(others):
         return
@@ -92,7 +98,7 @@ def relocate(
         value[targets] = value[sources]
     write_rows(params, optimizers, values, sources)
     for value in state.values():
-        if isinstance(value, Tensor):
+        if isinstance(value, Tensor) and value.ndim and len(value) == len(mask):
             value[sources] = 0
     if scene is not None:
         scene.on_relocate(targets, sources)
@@ -130,6 +136,13 @@ def inject_noise_to_position(
     axes = rotation_matrices(params["quats"].detach()) * params["scales"].detach().exp()[:, None, :]
     noise = torch.randn_like(means) * (torch.sigmoid(k * (t - opacities)) * scaler)[:, None]
     means += (axes @ (axes.transpose(1, 2) @ noise[:, :, None]))[..., 0]
+
+
+def _check_mask(params: Parameters, mask: Tensor) -> None:
+    """Raise TypeError or ValueError for what is no mask [N]; numbers would be indices."""
+    check_shape("mask", mask, (len(next(iter(params.values()))),))
+    if mask.dtype != torch.bool:
+        raise ValueError(f"mask is {mask.dtype}, expected torch.bool")
 
 
 def _draw(weights: Tensor, count: int) -> Tensor:
