@@ -47,7 +47,7 @@ def read_meshroom(folder: Path) -> DataparserOutputs:
         views = {str(view["path"]): dict(view) for view in values["views"]}
         poses = {str(pose["poseId"]): pose["pose"]["transform"] for pose in values["poses"]}
         lenses = {str(lens["intrinsicId"]): dict(lens) for lens in values["intrinsics"]}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, f"is not a file of Meshroom with poses ({error!r:.60})", _REMEDY) from None
     names = [name for name in sorted(views, key=natural_key) if str(views[name].get("poseId")) in poses]
     images = find_images(folder, names, path)
@@ -81,7 +81,7 @@ def _pose(transform: Any, view: dict, path: Path, name: str) -> np.ndarray:
         # The columns of a rotation are the rows of its inverse.
         inverse = np.array(transform["rotation"], np.float64).reshape(3, 3)
         matrix = np.c_[inverse, np.array(transform["center"], np.float64).reshape(3)]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, f"pose of {name!r:.90} cannot be used ({error!s:.40})", _REMEDY) from None
     return pose_from_camera_to_world(matrix, path, name)
 

@@ -96,7 +96,10 @@ def test_what_cannot_be_used_is_named(tmp_path):
     write(tmp_path, type="3deradial4")
     with pytest.raises(InputError, match="lens of 'IMG_0.jpg' is of type '3deradial4', which is not read; use radial3"):
         parse_dataset(tmp_path)
-    for change in ({"intrinsics": []}, {"poses": [{"poseId": []}]}, {"views": ["a"]}, {"version": "new"}):
+    endless = {"rotation": [10**400] * 9, "center": [0] * 3}
+    poses = [{"poseId": str(i), "pose": {"transform": endless}} for i in range(6)]
+    for change in ({"intrinsics": []}, {"poses": [{"poseId": []}]}, {"poses": poses}, {"views": ["a"]},
+                   {"version": "new"}, {"version": [float("inf")]}):  # fmt: skip
         write(tmp_path)
         with edited_json(tmp_path / "cameras.sfm") as values:
             values |= change
