@@ -137,7 +137,7 @@ def estimate_compensation(
         choice, least = "none", f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
         reason = "do not contradict the stated times" if times_known else f"differ by less than {least}"
         unlike = gains is not None and (gains.stops >= MIN_STOPS or gains.corner_loss >= MIN_CORNER_LOSS)
-        if gains is not None and unlike and not times_known:
+        if gains is not None and unlike:
             figures = f"{gains.stops:.2f} stops between photos and {gains.corner_loss:.0%} towards the corners"
             reason = f"differ by {figures}, and correcting that does not make them alike"
         reason = f"matched points {reason}{_reach_note(views, matched, response)}"
@@ -160,7 +160,7 @@ def estimate_compensation(
     compensation = fit(matched)
     components = _explanatory_components(compensation, views, matched, response, times_known)
     if not any(components):
-        return no_drift(matcher, matched, compensation)
+        return no_drift(matcher, matched, None if times_known else compensation)
     # Match again in photos that are already similar: more points are found.
     matcher = matcher_of(compensation.parts(**components._asdict()).normalize_photos(small, response))
     matched = match(matcher)

@@ -15,6 +15,7 @@ from ...progress import track_progress
 _log = logging.getLogger("sehdr_warp.scene")
 FEATURES = 512  # The largest ones of each photo, of 4,000 to 10,000
 PARTNERS = 12  # Photos that each one is matched with at least, unless they share nothing at all
+MOST_GUIDED = 1000  # Pairs of unplaced photos, along epipolar lines: 2 to 4 times the points, 2.7 times the time
 RATIO = 0.8  # Largest ratio of the angles to the best and to the second best match, as COLMAP has it
 
 

@@ -32,7 +32,7 @@ from ..masks import write_reduced
 from ..photo_names import photo_labels
 from ..photos import BRIGHTENING, brightened_codes, read_photo, unusable_notes
 from ..readers.colmap_model import SparseModel, read_model
-from .pairs import FEATURES, PARTNERS, RATIO, likely_pairs, pairs_with, remove_matches
+from .pairs import FEATURES, MOST_GUIDED, PARTNERS, RATIO, likely_pairs, pairs_with, remove_matches
 from .progress import counted_rows
 
 _log = logging.getLogger("sehdr_warp.scene")
@@ -43,8 +43,7 @@ SEED = 0
 FEWEST_SHARED = 60  # Points of a photo with fewer shared ones place it badly; sound photos have hundreds
 MOST_ERROR = 1.0  # Pixels; sound sets have 0.2 to 0.8
 _VERSION = 6  # Raised with every change of results that no constant of cache_key() states
-# Up to so many photos every pair is matched; in larger sets those that are likely to share points, and in still larger
-# ones each photo is matched with its neighbors by name.
+# Up to so many photos all pairs are matched; in larger sets likely ones; in still larger ones neighbors by name.
 EXHAUSTIVE_LIMIT, COMPARED_LIMIT = 30, 150
 OVERLAP = 20  # Neighbors on each side with which a photo of a larger set is matched, and as many powers of two
 _PAIR_COST, _PLACE_COST = 0.1, 0.45  # Time to match a pair and to place a photo, as parts of that of a photo's features
@@ -169,7 +168,7 @@ def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Pat
 
 def cache_key(*parts) -> str:
     """Name a result by all it depends on: `parts` (for JSON), constants here and of pairs, and pycolmap's version."""
-    pairing = (EXHAUSTIVE_LIMIT, COMPARED_LIMIT, OVERLAP, FEATURES, PARTNERS, RATIO)
+    pairing = (EXHAUSTIVE_LIMIT, COMPARED_LIMIT, MOST_GUIDED, OVERLAP, FEATURES, PARTNERS, RATIO)
     builds = sorted({each.version for each in distributions() if str(each.name).startswith("pycolmap")})  # -cuda12, too
     key = [_VERSION, *builds, MAX_SIDE, SEED, FEWEST_SHARED, pairing, BRIGHTENING, *parts]
     return hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
@@ -316,11 +315,12 @@ def _match_pairs(database: Path, pairs: Sequence[tuple[str, str]], guided: bool 
 
 
 def _match_missing(database: Path, names: set[str], placed: set[str]) -> None:
-    """Match photos that could not be placed with all others, along epipolar lines, which finds 2 to 4 times as many."""
+    """Match photos that could not be placed with all others, up to MOST_GUIDED pairs along epipolar lines."""
     pairs = pairs_with(names - placed, database)
-    remove_matches(pairs, database)
+    if guided := len(pairs) <= MOST_GUIDED:
+        remove_matches(pairs, database)
     with quiet_colmap(), stage("matching pairs of photos that could not be placed", len(pairs), _log):
-        run_interruptibly(partial(_match_pairs, database, pairs, guided=True))
+        run_interruptibly(partial(_match_pairs, database, pairs, guided=guided))
 
 
 def run_mapper(
