@@ -41,7 +41,7 @@ SCALE_PHOTOS = 256  # On which the deviations are scaled
 
 
 class Target(NamedTuple):
-    """What a network is trained to say of a batch, in stops over white: the truth, or what other networks say."""
+    """Mean and variance that a network learns to state for a batch, in stops over white: of the truth or of teachers."""
 
     mean: Tensor  # [B, 3, H, W]
     variance: Tensor  # [B, 3, H, W]; 0 of the truth
@@ -174,7 +174,7 @@ def main(
     packed = read_pack(pack)
     chosen = np.flatnonzero(~packed.held_out) if judged else np.arange(len(packed.panoramas))
 
-    def trained(own_seed: int, networks: Sequence[LightNetwork] = ()) -> LightNetwork:
+    def train_network(own_seed: int, networks: Sequence[LightNetwork] = ()) -> LightNetwork:
         rooms = LitRooms(lit_rooms, device, own_seed)
         return train(
             packed, chosen, steps=steps, seed=own_seed, device=device, lit_rooms=rooms, teachers=networks
@@ -184,10 +184,10 @@ def main(
     for each in range(seed, seed + teachers):
         path = out.with_name(f"{out.stem}_teacher_{each}.safetensors")
         if not path.is_file():
-            save(trained(each), 1.0, path)
+            save(train_network(each), 1.0, path)
         networks.append(copy.deepcopy(load_prior(device, path).network))
     own_seed = seed + teachers
-    network = trained(own_seed, networks)
+    network = train_network(own_seed, networks)
     # The deviations are scaled on panoramas of the training, or, of a judged run, on half of those that are held out.
     unseen = np.flatnonzero(packed.held_out)
     scale = fit_scale(network, packed, unseen[::2] if judged else chosen, seed=own_seed + 1, device=device)

@@ -104,7 +104,7 @@ def test_a_training_as_gsplats_simple_trainer_makes_one(name, packed, device):
 
 @pytest.mark.parametrize("name", ["default", "mcmc"])
 def test_a_subclass_overrides_steps_by_gsplats_names(name):
-    """With the arguments of 1.5, which has no scenes."""
+    """Override a step with the arguments of gsplat 1.5, which has no scenes."""
     calls = []
 
     class Default(DefaultStrategy):
