@@ -41,7 +41,7 @@ SCALE_PHOTOS = 256  # On which the deviations are scaled
 
 
 class Target(NamedTuple):
-    """Mean and variance that a network learns to state for a batch, in stops over white: of the truth or of teachers."""
+    """Mean and variance that a network learns to state for a batch, in stops over white: of truth or of teachers."""
 
     mean: Tensor  # [B, 3, H, W]
     variance: Tensor  # [B, 3, H, W]; 0 of the truth

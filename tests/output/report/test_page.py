@@ -97,7 +97,7 @@ def test_lights_are_listed_with_what_is_certain_of_them(tmp_path, monkeypatch):
     assert len(cells) == 12 * 8
     assert [cell.replace("\N{NARROW NO-BREAK SPACE}", " ") for cell in cells[:8]] == [
         *("light_0", "rect", "0.4 \N{MULTIPLICATION SIGN} 0.2", place),
-        *("50.0%", "4 670", "1", "0.7"),
+        *("50.0%", "4 670", "1", "0.4"),
     ]
     assert cells[8:10] == ["light_1", "sphere"] and cells[15] == "\N{EN DASH}"
     assert "uncertain by" not in text  # The last one is, and is not in the table.
