@@ -4,7 +4,6 @@ One run is deterministic on one kind of machine. With --judge the held-out panor
 the model card are printed and written beside the weights.
 """
 
-import copy
 import json
 import os
 import time
@@ -185,7 +184,7 @@ def main(
         path = out.with_name(f"{out.stem}_teacher_{each}.safetensors")
         if not path.is_file():
             save(train_network(each), 1.0, path)
-        networks.append(copy.deepcopy(load_prior(device, path).network))
+        networks.append(load_prior(device, path).network)
     own_seed = seed + teachers
     network = train_network(own_seed, networks)
     # The deviations are scaled on panoramas of the training, or, of a judged run, on half of those that are held out.

@@ -206,15 +206,14 @@ def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> 
     if not placed:
         problem = f"holds none of the {len(cameras)} photos that the run was trained with, but {first_names(names)}"
         raise InputError(dataset.folder, problem, "say where they are")
-    notes = []
+    notes = [note for note in dataset.notes if "cameras are found anew" not in note]
     if others:
         count = counted(len(others), "photo is not in the run and is", "photos are not in the run and are")
         notes.append(f"{count} left out: {all_names(names, others)}")
     if left:
         count = counted(len(left), "photo of the run is", "photos of the run are")
         notes.append(f"{count} missing: {', '.join(cameras[number].file for number in sorted(left))}")
-    stated = (note for note in dataset.notes if "cameras are found anew" not in note)
-    return replace(dataset, records=tuple(placed), notes=(*stated, *notes)), [names[i] for i in others]
+    return replace(dataset, records=tuple(placed), notes=tuple(notes)), [names[i] for i in others]
 
 
 def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:
