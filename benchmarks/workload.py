@@ -8,10 +8,10 @@ from torch import Tensor
 
 from sehdr_warp.kernels.blend_cuda import BLOCKS_PER_TILE
 from sehdr_warp.kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
-from sehdr_warp.rasterizer.block_blending import blend_on_cuda
-from sehdr_warp.rasterizer.projection import Splats, project_to_camera
+from sehdr_warp.rasterizer.blending_cuda import blend_on_cuda
+from sehdr_warp.rasterizer.projection import Splats2D, project_to_camera
 from sehdr_warp.rasterizer.render_options import RenderOptions
-from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_intersections, pack_splats
+from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_gaussians, pack_splats
 
 
 class Workload(NamedTuple):
@@ -42,8 +42,8 @@ def count_blended_pairs(arguments: Sequence[Tensor], width: int, height: int) ->
     )
     options = RenderOptions(width, height)
     projected = project_to_camera(means, log_scales, quaternions, opacities, world_to_camera, intrinsics, options)
-    packed = pack_splats(Splats(*projected, features), ALPHA_THRESHOLD, width, height)
-    lists = build_tile_lists(packed, order_intersections(packed, keep_emit_order=False), width, height)
+    packed = pack_splats(Splats2D(*projected, features), ALPHA_THRESHOLD, width, height)
+    lists = build_tile_lists(packed, order_gaussians(packed, keep_emit_order=False), width, height)
     assert lists.subtile_masks is not None, "block kernels need lists with subtile_masks"
     image, transmittance = features.new_empty(height, width, features.shape[1]), features.new_empty(height, width)
     blended = blend_on_cuda(features, lists, packed, image, transmittance, ALPHA_THRESHOLD, deterministic=False)

@@ -1,8 +1,8 @@
 """The last stage of a render: blend the tile lists front to back, any number of channels in one pass.
 
-blend() calls the backend of its device, blend_on_cpu() or blend_on_cuda(), which fills the image and returns its
-backward pass. Called with the gradients with respect to image and transmittance (None for 0), that returns the
-gradients by Gaussian, [N, C + 6 or more]: features, conic a b c, x, y, opacity, and columns that pad a row.
+blend() calls the backend of its device, blend_on_cpu() or blend_on_cuda(), which fills the image and returns the
+backward pass: a function of the gradients with respect to image and transmittance (None for 0). It returns a row of
+gradients for each Gaussian, [N, C + 6 or more]: features, conic a b c, x, y, opacity, and columns that pad the row.
 with_gradient() makes this a node of the autograd graph, whose inputs are in the order of these columns.
 """
 
@@ -16,9 +16,9 @@ from torch import Tensor
 from ..kernels import blend_cpu
 from ..kernels.constants import TILE_SIZE
 from ..parallel import thread_count
-from .block_blending import blend_on_cuda
+from .blending_cuda import blend_on_cuda
 from .gradients import sum_by_gaussian
-from .projection import Splats
+from .projection import Splats2D
 from .tile_lists import PackedSplats, TileLists
 from .torch_contract import direct_apply, keeps_graph, once_differentiable
 from .warp_launch.launching import launch, warp_scalar
@@ -26,8 +26,7 @@ from .warp_launch.launching import launch, warp_scalar
 ROWS_OF_TILE = blend_cpu.HALVES * TILE_SIZE  # Of LANES pixels each
 RANGES_PER_THREAD = 16  # Ranges of tiles on the CPU: their work differs by more than their intersections.
 GradientsByTensor = Callable[[Tensor, Tensor | None], Sequence[Tensor]]
-"""Maps the gradients with respect to image and transmittance (None for 0) to those with respect to what was blended:
-columns of the gradients by Gaussian."""
+"""Maps the gradients with respect to image and transmittance (None for 0) to those with respect to what was blended."""
 
 
 class BlendResult(NamedTuple):
@@ -45,7 +44,7 @@ class BlendResult(NamedTuple):
 
 
 def blend(
-    splats: Splats, lists: TileLists, packed: PackedSplats, alpha_threshold: float, deterministic: bool = False
+    splats: Splats2D, lists: TileLists, packed: PackedSplats, alpha_threshold: float, deterministic: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Blend splats over their tile lists; return the image [H, W, C] and the transmittance [H, W].
 
@@ -60,11 +59,11 @@ def blend(
     # Detached: the autograd node owns the backward function, which must not refer to the node's own results.
     arguments = features.detach(), lists, packed, image.detach(), transmittance.detach(), alpha_threshold
     on_gpu = features.device.type == "cuda"
-    gradients_by_gaussian = blend_on_cuda(*arguments, deterministic) if on_gpu else blend_on_cpu(*arguments)
+    differentiate = blend_on_cuda(*arguments, deterministic) if on_gpu else blend_on_cpu(*arguments)
 
     def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        gradients = gradients_by_gaussian(grad_image, grad_transmittance)
-        *others, opacity_and_padding = gradients.tensor_split((channels, channels + 3, channels + 5), 1)
+        rows = differentiate(grad_image, grad_transmittance)
+        *others, opacity_and_padding = rows.tensor_split((channels, channels + 3, channels + 5), 1)
         return *others, opacity_and_padding.select(1, 0)
 
     result = BlendResult(image, transmittance, backward)

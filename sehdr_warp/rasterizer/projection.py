@@ -54,7 +54,7 @@ class ProjectedGaussians(NamedTuple):
     extents: Tensor
 
 
-class Splats(NamedTuple):
+class Splats2D(NamedTuple):
     """ProjectedGaussians and their features [N, C], as the stages after projection read them: contiguous."""
 
     means2d: Tensor

@@ -21,9 +21,9 @@ from .blending import blend, with_gradient
 from .checks import check_cameras, check_channels, check_opacities, check_tensors
 from .cuda_graphs.cache import GraphInUse, GraphPool, checked_pool, pool_for
 from .memory import oom_context
-from .projection import GaussiansAndCamera, ProjectedGaussians, Splats, project_to_camera
+from .projection import GaussiansAndCamera, ProjectedGaussians, Splats2D, project_to_camera
 from .render_options import RenderOptions
-from .tile_lists import build_tile_lists, order_intersections, pack_splats
+from .tile_lists import build_tile_lists, order_gaussians, pack_splats
 from .torch_contract import torch_operation
 
 
@@ -148,7 +148,7 @@ def rasterize(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
     tensors = GaussiansAndCamera(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
-    pool = checked_pool(tensors, options)  # CUDA graphs of calls like this one, which were checked; None on the CPU.
+    pool = checked_pool(tensors, options)  # CUDA graphs of calls that were checked but for the background; or None
     if pool is None or background is not None:
         check_shapes(tensors, background)
         check_opacities(opacities)
@@ -165,8 +165,7 @@ def rasterize(
             rendering.image = rendering.image + rendering.transmittance[..., None] * behind
         return rendering
     except (RuntimeError, MemoryError):  # The context around all of it would take 2 us of each call.
-        # Within a capture of the caller's, where nothing can be replayed, this raises the error that says what to do.
-        options.checked(means.device)
+        options.checked(means.device)  # It says what to do if the caller is capturing a CUDA graph.
         with oom_context(means.device, lambda: (len(means), width, height, features.shape[-1])):
             raise
 
@@ -200,8 +199,9 @@ def check_shapes(tensors: GaussiansAndCamera, background: Any) -> None:
 def _begin_view(
     tensors: GaussiansAndCamera, options: RenderOptions, pool: GraphPool | None
 ) -> tuple[Tensor, Callable[[Tensor], Rendering]]:
-    """Project to one camera; return means2d [N, 2], and what renders from them or, of several cameras, from a part.
+    """Project to one camera; return means2d [N, 2], and a function that renders from them.
 
+    The function is called with the tensor that the Rendering will hold: of several cameras a part of all means2d.
     pool: CUDA graphs of calls like this one; None if it is to be launched.
     """
     graph = None if pool is None else pool.begin_render(tensors, options)
@@ -278,10 +278,10 @@ def render_projected(
     splats = _to_splats(projected, features, options)
     width, height, threshold = options.width, options.height, options.alpha_threshold
     packed = pack_splats(splats, threshold, width, height)
-    # Sums of gradients in a fixed order need it, atomics of a GPU do not.
-    keep_emit_order = features.device.type == "cpu" or options.deterministic
-    order = order_intersections(packed, keep_emit_order=keep_emit_order)
-    lists = build_tile_lists(packed, order, width, height, options.max_intersections, keep_emit_order=keep_emit_order)
+    # Whether gradients are summed in a fixed order, as atomics of a GPU do not.
+    in_order = features.device.type == "cpu" or options.deterministic
+    emit_order = order_gaussians(packed, keep_emit_order=in_order)
+    lists = build_tile_lists(packed, emit_order, width, height, options.max_intersections, keep_emit_order=in_order)
     image, transmittance = blend(splats, lists, packed, threshold, options.deterministic)
     if store_absolute is not None:
         image, transmittance = watch_absolute_gradients(
@@ -292,11 +292,11 @@ def render_projected(
     return _rendering(options, *results, lists.intersection_count, lists.overflow, needed)
 
 
-def _to_splats(projected: ProjectedGaussians, features: Tensor, options: RenderOptions) -> Splats:
+def _to_splats(projected: ProjectedGaussians, features: Tensor, options: RenderOptions) -> Splats2D:
     if options.depth:
         features = torch.cat([features, projected.depths[:, None]], 1)
     # extents.data: pack_splats() writes to it in place, which torch's check of saved tensors must not see.
-    return Splats(*projected[:4], projected.extents.data, features.contiguous())
+    return Splats2D(*projected[:4], projected.extents.data, features.contiguous())
 
 
 def _rendering(options: RenderOptions, image: Tensor, *others: Any) -> Rendering:

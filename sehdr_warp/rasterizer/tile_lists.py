@@ -16,7 +16,7 @@ from ..kernels import tiles as kernels
 from ..kernels.blend_cuda import padded_channels
 from ..kernels.constants import TILE_SIZE
 from ..parallel import thread_count
-from .projection import Splats
+from .projection import Splats2D
 from .render_options import MAX_INTERSECTIONS
 from .warp_launch.launching import FixedLaunch, fixed_launch, launch, sort_pairs, warp_scalar
 from .warp_launch.threads import torch_threads
@@ -34,8 +34,8 @@ class PackedSplats(NamedTuple):
         conics_cutoffs: [N, 4] conic a, b, c, and the value of a dx^2 + 2 b dx dy + c dy^2 at which alpha meets the
             threshold; -1 if culled.
         counts: [N] int64 tiles that the ellipse touches.
-        depths: [N] as of Splats.
-        extents: [N, 2] as of Splats.
+        depths: [N] as of Splats2D.
+        extents: [N, 2] as of Splats2D.
         padded: [N, columns] features with columns of zeros for whole rows of four, which block kernels read at once;
             None if they do not read them from here.
     """
@@ -117,7 +117,7 @@ class TileLists:
 
 
 def pack_splats(
-    splats: Splats, alpha_threshold: float, width: int, height: int, *, pads: bool | None = None
+    splats: Splats2D, alpha_threshold: float, width: int, height: int, *, pads: bool | None = None
 ) -> PackedSplats:
     """Pack splats for an image, and count the tiles that each one's ellipse touches.
 
@@ -143,7 +143,7 @@ def pack_splats(
 
 
 def fixed_pack_splats(
-    splats: Splats, packed: PackedSplats, alpha_threshold: float, width: int, height: int
+    splats: Splats2D, packed: PackedSplats, alpha_threshold: float, width: int, height: int
 ) -> FixedLaunch:
     """Return the launch that fills `packed` anew, whose tensors stay where they are but for the features."""
     kernel = kernels.tile_kernels(warp_scalar(splats.features.dtype)).pack_splats
@@ -152,7 +152,7 @@ def fixed_pack_splats(
 
 
 def _pack_arguments(
-    splats: Splats, packed: PackedSplats, alpha_threshold: float, width: int, height: int
+    splats: Splats2D, packed: PackedSplats, alpha_threshold: float, width: int, height: int
 ) -> tuple[Any, ...]:
     means2d, conics, _, opacities, extents, features = splats
     padded = None if packed.padded is None else packed.padded.view(-1, 4)
@@ -163,11 +163,11 @@ def _pack_arguments(
 
 
 @torch.no_grad()
-def order_intersections(packed: PackedSplats, *, keep_emit_order: bool = True) -> EmitOrder:
-    """Return the order in which Gaussians emit intersections: by depth.
+def order_gaussians(packed: PackedSplats, *, keep_emit_order: bool = True) -> EmitOrder:
+    """Order Gaussians by depth, as they emit intersections.
 
-    keep_emit_order: of build_tile_lists(). Without it a sort of few Gaussians is spared, because that of their
-        intersections also sorts by depth.
+    keep_emit_order: whether build_tile_lists() is to keep the order. Without it few Gaussians are not sorted, because
+        the sort of their intersections also sorts by depth.
     """
     counts, depths = packed.counts, packed.depths
     if len(depths) <= MAX_SINGLE_SORT and not keep_emit_order and depths.dtype == torch.float32:

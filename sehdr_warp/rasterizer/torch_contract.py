@@ -103,8 +103,8 @@ def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
     """Let what differentiates a gradient raise RuntimeError, and a batch of gradients NotImplementedError.
 
     torch.autograd.function.once_differentiable() raises nothing if the upstream gradient is a constant, as below a sum:
-    the second derivative would then silently lack this node's part. This one also refuses derivatives by the inputs
-    that the node has saved.
+    the second derivative would then silently lack this node's part. This one also refuses derivatives with
+    respect to the inputs that the node has saved.
     """
 
     @wraps(backward)

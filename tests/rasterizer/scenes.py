@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from sehdr_warp.rasterizer.projection import ProjectedGaussians, Splats, project_to_camera
+from sehdr_warp.rasterizer.projection import ProjectedGaussians, Splats2D, project_to_camera
 from sehdr_warp.rasterizer.render_options import RenderOptions
 from sehdr_warp.rasterizer.tile_lists import PackedSplats, pack_splats
 
@@ -65,7 +65,7 @@ def projected(scene: SplatInputs, threshold: float = 1 / 255) -> ProjectedGaussi
 
 def packed(scene: SplatInputs, threshold: float = 1 / 255) -> PackedSplats:
     gaussians = projected(scene, threshold)
-    splats = Splats(*gaussians, gaussians.means2d.new_empty(len(gaussians.means2d), 0))
+    splats = Splats2D(*gaussians, gaussians.means2d.new_empty(len(gaussians.means2d), 0))
     return pack_splats(splats, threshold, scene.width, scene.height)
 
 

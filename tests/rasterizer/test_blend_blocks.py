@@ -9,12 +9,12 @@ import warp as wp
 from torch.profiler import ProfilerActivity, profile
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.rasterizer import blending, block_blending, tile_lists
+from sehdr_warp.rasterizer import blending, blending_cuda, tile_lists
 from sehdr_warp.rasterizer.blending import blend
-from sehdr_warp.rasterizer.block_blending import BlockBackward, blend_on_cuda
-from sehdr_warp.rasterizer.projection import Splats
+from sehdr_warp.rasterizer.blending_cuda import BlockBackward, blend_on_cuda
+from sehdr_warp.rasterizer.projection import Splats2D
 from sehdr_warp.rasterizer.reference import blend_reference
-from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_intersections
+from sehdr_warp.rasterizer.tile_lists import build_tile_lists, order_gaussians
 
 from .scenes import packed, projected, random_like, random_scene, relative_error
 
@@ -41,10 +41,10 @@ def blocks(monkeypatch):
 def leaves_and_lists(scene):
     """Return arguments of blend(): splats whose tensors are leaves, lists and packed Gaussians."""
     gaussians, splats = projected(scene), packed(scene)
-    order = order_intersections(splats)
+    order = order_gaussians(splats)
     lists = build_tile_lists(splats, order, scene.width, scene.height, keep_emit_order=True)
     leaves = [tensor.detach().requires_grad_() for tensor in (*gaussians, scene.tensors[4])]
-    return Splats(*leaves), lists, splats
+    return Splats2D(*leaves), lists, splats
 
 
 def test_more_gradients_than_int32_counts_are_refused_in_a_fixed_order():
@@ -93,7 +93,7 @@ def test_a_single_pixels_gradient_may_have_any_strides(blocks):
 
 def test_nothing_more_by_gaussian_is_kept_for_the_backward_pass(blocks, monkeypatch):
     monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
-    monkeypatch.setattr(block_blending, "MAX_SINGLE_SORT", 0)  # few are kept padded
+    monkeypatch.setattr(blending_cuda, "MAX_SINGLE_SORT", 0)  # few are kept padded
     scene = random_scene(count=600, channels=3, width=44, height=26, seed=2).to(torch.float32, "cpu")
     leaves, lists, splats = leaves_and_lists(scene)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:

@@ -13,7 +13,7 @@ from sehdr_warp.rasterizer.tile_lists import (
     depth_order,
     emit_intersections,
     find_tile_ranges,
-    order_intersections,
+    order_gaussians,
 )
 from sehdr_warp.rasterizer.warp_launch.launching import sort_pairs
 
@@ -36,7 +36,7 @@ def counted(*scene):
 
 
 def built(splats, max_intersections=None, *, keep_emit_order=True):
-    emit_order = order_intersections(splats, keep_emit_order=keep_emit_order)
+    emit_order = order_gaussians(splats, keep_emit_order=keep_emit_order)
     return build_tile_lists(
         splats, emit_order, 16 * GRID.columns, 16 * GRID.rows, max_intersections, keep_emit_order=keep_emit_order
     )
@@ -111,7 +111,7 @@ def test_depths_beyond_the_bits_of_the_keys_keep_their_order_up_to_ties(device):
     one = {"counts": torch.ones_like(splats.counts), "extents": torch.full_like(splats.extents, 3.0)}
     splats = splats._replace(depths=depths, **everywhere, **one)
     for keep_emit_order, expected in ((False, [2, 3, 6, 4, 5, 0, 1]), (True, [3, 2, 6, 4, 5, 0, 1])):
-        emit_order = order_intersections(splats, keep_emit_order=keep_emit_order)
+        emit_order = order_gaussians(splats, keep_emit_order=keep_emit_order)
         assert build_tile_lists(splats, emit_order, 16, 16).gaussians.tolist() == expected
 
 
@@ -119,7 +119,7 @@ def test_subtiles_are_those_that_an_ellipse_touches(device):
     """Beside what all pixels of a subtile see of a Gaussian, drawn alone."""
     scene = random_scene(count=40, width=32, height=32, spread=0.8, seed=3).to(torch.float32, device)
     splats = packed(scene)
-    lists = build_tile_lists(splats, order_intersections(splats, keep_emit_order=False), 32, 32)
+    lists = build_tile_lists(splats, order_gaussians(splats, keep_emit_order=False), 32, 32)
     columns, rows = torch.meshgrid(torch.arange(32.0, device=device), torch.arange(32.0, device=device), indexing="xy")
     (x, y, *_), (a, b, c, cutoff) = (record[lists.gaussians.long()].t()[..., None, None] for record in splats[:2])
     dx, dy = columns + 0.5 - x, rows + 0.5 - y

@@ -25,7 +25,7 @@ from torch import Tensor
 from torch._C._dynamo.guards import TensorGuards
 
 from ..blending import BlendResult
-from ..projection import GaussiansAndCamera, Splats, with_projection_gradient
+from ..projection import GaussiansAndCamera, Splats2D, with_projection_gradient
 from ..render_options import RenderOptions
 from ..tile_lists import MAX_SINGLE_SORT
 from ..warp_launch.launching import stream_handle
@@ -151,7 +151,7 @@ class GraphInUse:
         means2d, conics_opacities, depths, extents = outputs
         return blended, means2d, depths, extents, conics_opacities
 
-    def render_projected(self, splats: Splats) -> BlendResult:
+    def render_projected(self, splats: Splats2D) -> BlendResult:
         """Render; write the extents that are left, see pack_splats()."""
         image, transmittance, _, self._prepared = self._graph.replay(splats, (splats.extents,))
         return BlendResult(image, transmittance, self.blend_backward)
@@ -168,7 +168,7 @@ class GraphInUse:
         return None
 
     def blend_backward(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        """Return the gradients by what was blended, see CapturedBackward.blend()."""
+        """Return the gradients with respect to what was blended, see CapturedBackward.blend()."""
         backward = self._graph.backward
         assert backward is not None
         memory, self._prepared = self._prepared or backward.allocate(), None
@@ -178,9 +178,9 @@ class GraphInUse:
     def project_backward(
         self, inputs: Sequence[Tensor], visibility: Tensor, upstream: Sequence[Tensor | None], needed: Sequence[bool]
     ) -> Sequence[Tensor | None]:
-        """Return the gradients by the projection's inputs, see ProjectionBackward.
+        """Return the gradients with respect to the projection's inputs, see ProjectionBackward.
 
-        upstream: gradients by means2d, conics_opacities (GradientMemory.zeros, from blend_backward()), and depths.
+        upstream: of means2d, conics_opacities (GradientMemory.zeros, from blend_backward()), and depths.
         """
         grad_means2d, zeros, grad_depths, _ = upstream
         backward = self._graph.backward
@@ -205,8 +205,8 @@ class GraphPool:
     idle: list[RenderGraph] = field(default_factory=list)  # CUDA graphs that no call holds
     last_use: int = 0  # Number of the last call
 
-    def begin_render(self, tensors: GaussiansAndCamera | Splats, options: RenderOptions) -> GraphInUse | None:
-        """Return a CUDA graph for one render, from Splats if they are projected already.
+    def begin_render(self, tensors: GaussiansAndCamera | Splats2D, options: RenderOptions) -> GraphInUse | None:
+        """Return a CUDA graph for one render, from Splats2D if they are projected already.
 
         None if the call is to be launched instead.
         """
@@ -216,7 +216,7 @@ class GraphPool:
             graph = self._capture(tensors, options)
         return None if graph is None else GraphInUse(self, graph)
 
-    def _capture(self, tensors: GaussiansAndCamera | Splats, options: RenderOptions) -> RenderGraph | None:
+    def _capture(self, tensors: GaussiansAndCamera | Splats2D, options: RenderOptions) -> RenderGraph | None:
         self.launched += 1
         if self.launched <= WARMUP_CALLS or self.captured >= self.max_graphs:
             return None

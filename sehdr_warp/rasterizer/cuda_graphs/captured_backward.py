@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...kernels.blend_cuda_backward import copy_features_kernel
 from ...kernels.project import projection_kernel
-from ..block_blending import BlockBackward
+from ..blending_cuda import BlockBackward
 from ..projection import ProjectedGaussians, adjoint_arguments, projection_parameters
 from ..render_options import RenderOptions
 from ..warp_launch.launching import FixedLaunch, fixed_launch, warp_scalar, warp_stream
@@ -31,10 +31,10 @@ class _View(NamedTuple):
 class GradientMemory:
     """Zeros that a backward pass of blend and projection adds to, and the views of them that it returns.
 
-    of_splats: by features and means2d; if the CUDA graph begins with 2D Gaussians, by features, conics, means2d and
+    of_splats: of features and means2d; if the CUDA graph begins with 2D Gaussians, of features, conics, means2d and
     opacities. Emptied when they are returned, because torch takes a leaf's gradient without a copy only if nothing else
     refers to it.
-    of_gaussians: by the projection's inputs, None where not needed.
+    of_gaussians: of the projection's inputs, None where not needed.
     """
 
     zeros: Tensor
@@ -46,10 +46,10 @@ class GradientLayout:
     """Views of the gradients of blend and projection in one tensor.
 
     It begins with a row for each Gaussian, which the blend adds to: features, conic, x, y, opacity, and columns that
-    pad the row. Then come a copy of the features' gradient and the gradients by the projection's inputs.
+    pad the row. Then come a copy of the features' gradient and the gradients of the projection's inputs.
 
     gaussians: inputs of the projection, None where no gradient is needed; empty if the CUDA graph begins with 2D
-    Gaussians. copies_features: add a contiguous gradient by features, which torch can use as a leaf's without a copy.
+    Gaussians. copies_features: add a contiguous gradient of features, which torch can use as a leaf's without a copy.
     like: a tensor of the shape of all of it that takes no memory, for torch.empty_like().
     """
 
@@ -122,7 +122,7 @@ class CapturedBackward:
         return GradientMemory(zeros, of_splats, of_gaussians)
 
     def blend(self, memory: GradientMemory, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        """Return the gradients by GradientMemory.of_splats and, if the graph projects, by conics_opacities."""
+        """Return GradientMemory.of_splats and, if the graph projects, the gradient of conics_opacities."""
         rows = memory.zeros.data_ptr()
         transmittance = 0 if grad_transmittance is None else grad_transmittance.data_ptr()
         self._blend.launch((), (grad_image.data_ptr(), transmittance, rows), self._stream)
@@ -134,7 +134,7 @@ class CapturedBackward:
     def project(
         self, memory: GradientMemory, grad_means2d: Tensor | None, grad_depths: Tensor | None
     ) -> Sequence[Tensor | None]:
-        """Return the gradients by the projection's inputs.
+        """Return the gradients of the projection's inputs.
 
         memory: of the blend's backward pass, or if the image has no gradient, a new one.
         """
@@ -153,7 +153,7 @@ def _fixed_projection_backward(
 ) -> FixedLaunch:
     """Return the launch of a projection's adjoint on the same inputs and extents, for any gradients.
 
-    rows: like the gradients by Gaussian, which hold those by conics and opacities.
+    rows: like the gradients for each Gaussian, which hold those of conics and opacities.
     """
     grad_means2d, grad_depths = torch.empty_like(projected.means2d), torch.empty_like(projected.depths)
     grad_conics, grad_opacities = rows.as_strided(*layout.conics), rows.as_strided(*layout.opacities)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ...kernels.caller_memory import write_last
 from ...kernels.project import projection_kernel
-from ..block_blending import BlockBackward, blend_on_cuda, fixed_blend_blocks
-from ..projection import GaussiansAndCamera, ProjectedGaussians, Splats, project_to_camera, projection_parameters
+from ..blending_cuda import BlockBackward, blend_on_cuda, fixed_blend_blocks
+from ..projection import GaussiansAndCamera, ProjectedGaussians, Splats2D, project_to_camera, projection_parameters
 from ..render_options import MAX_INTERSECTIONS, RenderOptions
 from ..tile_lists import (
     MAX_SINGLE_SORT,
@@ -21,7 +21,7 @@ from ..tile_lists import (
     TileLists,
     build_tile_lists,
     fixed_pack_splats,
-    order_intersections,
+    order_gaussians,
     pack_splats,
 )
 from ..warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar, warp_stream
@@ -52,7 +52,7 @@ class RenderGraph:
     """
 
     def __init__(
-        self, tensors: GaussiansAndCamera | Splats, options: RenderOptions, intersections: int, differentiable: bool
+        self, tensors: GaussiansAndCamera | Splats2D, options: RenderOptions, intersections: int, differentiable: bool
     ) -> None:
         """Launch the render once, then capture it.
 
@@ -101,7 +101,7 @@ class RenderGraph:
         if not self._copies:
             self._inputs, self._to_project = [], None  # The caller's.
 
-    def _render(self) -> tuple[Splats, BlockBackward]:
+    def _render(self) -> tuple[Splats2D, BlockBackward]:
         """Run all stages, which the methods below are, in their order."""
         self._callers.read(self._inputs)
         splats, packed = self._project_and_pack()
@@ -110,33 +110,33 @@ class RenderGraph:
         self._write(splats)
         return splats, backward
 
-    def _project_and_pack(self) -> tuple[Splats, PackedSplats]:
+    def _project_and_pack(self) -> tuple[Splats2D, PackedSplats]:
         options = self._options
-        splats = Splats(*self._inputs) if self._to_project is None else _project(self._to_project, options)
+        splats = Splats2D(*self._inputs) if self._to_project is None else _project(self._to_project, options)
         pads = not self._copies or self._image.shape[2] % 4 > 0
         return splats, pack_splats(splats, options.alpha_threshold, options.width, options.height, pads=pads)
 
     def _order_and_count(self, packed: PackedSplats) -> EmitOrder:
-        emit_order = order_intersections(packed, keep_emit_order=False)
+        emit_order = order_gaussians(packed, keep_emit_order=False)
         launch(write_last, 1, emit_order.cumulative_counts, self._counter)  # What follows waits longer for a copy.
         return emit_order
 
     def _list(self, packed: PackedSplats, emit_order: EmitOrder) -> TileLists:
         return build_tile_lists(packed, emit_order, self._options.width, self._options.height, self.max_intersections)
 
-    def _blend(self, splats: Splats, packed: PackedSplats, lists: TileLists) -> BlockBackward:
+    def _blend(self, splats: Splats2D, packed: PackedSplats, lists: TileLists) -> BlockBackward:
         outputs, threshold = (self._image, self._transmittance), self._options.alpha_threshold
         return blend_on_cuda(splats.features, lists, packed, *outputs, threshold, False, keeps_padded=True)
 
-    def _write(self, splats: Splats) -> None:
+    def _write(self, splats: Splats2D) -> None:
         zeros = 0 if self._gradients is None else self._gradients.numel()
         self._callers.write([self._image, self._transmittance, *self._projection_of(splats)], zeros)
 
-    def _projection_of(self, splats: Splats) -> list[Tensor]:
+    def _projection_of(self, splats: Splats2D) -> list[Tensor]:
         """Return what a render returns beside image and transmittance."""
         return [splats.extents] if self._to_project is None else [splats.means2d, splats.depths, splats.extents]
 
-    def _layout_for(self, tensors: GaussiansAndCamera | Splats, blend: BlockBackward) -> GradientLayout:
+    def _layout_for(self, tensors: GaussiansAndCamera | Splats2D, blend: BlockBackward) -> GradientLayout:
         """Return the layout of the gradients that these tensors of a call require."""
         if self._to_project is None or not isinstance(tensors, GaussiansAndCamera):
             return GradientLayout(blend, [], copies_features=_is_trained(tensors.features))
@@ -146,7 +146,7 @@ class RenderGraph:
         copies_features = _is_trained(tensors.features) and not self._options.depth
         return GradientLayout(blend, gaussians, copies_features=copies_features)
 
-    def _fix_launches(self, splats: Splats, packed: PackedSplats, lists: TileLists) -> None:
+    def _fix_launches(self, splats: Splats2D, packed: PackedSplats, lists: TileLists) -> None:
         """Prepare the launches of _launch()."""
         assert packed.padded is not None and self._to_project is not None
         options, outputs = self._options, (self._image, self._transmittance)
@@ -209,11 +209,11 @@ def _is_trained(tensor: Tensor) -> bool:
     return tensor.is_leaf and tensor.requires_grad
 
 
-def _project(tensors: GaussiansAndCamera, options: RenderOptions) -> Splats:
+def _project(tensors: GaussiansAndCamera, options: RenderOptions) -> Splats2D:
     projected, features = project_to_camera(*tensors.without_features, options=options), tensors.features
     if options.depth:
         features = torch.cat([features, projected.depths[:, None]], 1)
-    return Splats(*projected, features)
+    return Splats2D(*projected, features)
 
 
 def _fixed_projection(

@@ -14,7 +14,7 @@ from sehdr_warp.compat.gsplat import rasterization
 from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.radiance_field import RadianceField
-from sehdr_warp.rasterizer import block_blending, rasterize, render_options, tile_lists
+from sehdr_warp.rasterizer import blending_cuda, rasterize, render_options, tile_lists
 from sehdr_warp.rasterizer.cuda_graphs import cache, render_graph
 from sehdr_warp.rasterizer.memory import OutOfMemory
 from sehdr_warp.rasterizer.render_options import RenderOptions
@@ -48,7 +48,7 @@ def values_and_gradients(splat, scene, *, by_alpha=True, **options):
 @pytest.mark.parametrize("options", [{}, {"by_alpha": False}, {"depth": True, "antialiased": True}])
 def test_replays_follow_their_arguments_and_their_need_of_room(options, many, monkeypatch):
     if many:  # As with more Gaussians than one sort takes.
-        for module in (tile_lists, block_blending, render_graph, cache):
+        for module in (tile_lists, blending_cuda, render_graph, cache):
             monkeypatch.setattr(module, "MAX_SINGLE_SORT", 0)
         monkeypatch.setattr(render_graph, "MAX_COPIED_GAUSSIANS", 0)
     for count, channels in ((80, 3), (40, 9), (80, 3)):

@@ -57,7 +57,7 @@ class BlockBackward:
     deterministic: bool
 
     def __call__(self, grad_image: Tensor, grad_transmittance: Tensor | None) -> Tensor:
-        """Return the gradients by Gaussian."""
+        """Return a row of gradients for each Gaussian."""
         lists = self.lists
         if not self.deterministic:
             gradients = self._zeros()
@@ -80,8 +80,8 @@ class BlockBackward:
     def on_fixed_memory(self) -> "FixedBackward":
         """Return the backward pass for less host time; for use while all tensors stay where they are.
 
-        features are padded, or the backward pass would read what they were at this call. Each launch gives the
-        addresses of the gradients of image and transmittance (0 for none) and of those by Gaussian, zeros to add to.
+        features are padded, or the backward pass would read what they were at this call. Each launch gives addresses:
+        of the gradients of image and transmittance (0 for none), and of the rows of Gaussians, zeros to add to.
         """
         assert not self.deterministic, "sums in a fixed order are several launches"
         grad_image = self.transmittance.new_empty(*self.transmittance.shape, self.channels)
@@ -100,7 +100,7 @@ class BlockBackward:
 
     @property
     def columns(self) -> int:
-        """Columns of the gradients by Gaussian."""
+        """Number of columns of the gradients."""
         columns = self.channels + 6
         if blend_cuda_backward.adds_quads(warp_scalar(self.features.dtype), self.deterministic, self._cuda):
             columns = blend_cuda.padded_channels(columns)
@@ -129,7 +129,7 @@ class FixedBackward(NamedTuple):
 
     Attributes:
         fixed: its launch.
-        gradients: a tensor like those by Gaussian that BlockBackward returns.
+        gradients: a tensor like the rows that BlockBackward returns.
     """
 
     fixed: FixedLaunch
