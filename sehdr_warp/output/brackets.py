@@ -45,7 +45,7 @@ def bracket_exposures(
 
     Args:
         base_time: Seconds at 0 EV.
-        evs: Stops, such as "-4,-2,0" or [-4, -2, 0]. Give either evs or exposures.
+        evs: Stops, such as "-4,-2,0" or [-4, -2, 0]. Set either evs or exposures.
         exposures: Seconds, stops or multiples of the base time, such as "1/125, -2ev, 8x"; numbers are seconds.
 
     Raises:
@@ -105,7 +105,7 @@ def write_brackets(
         out: Folder for the files.
         views: Name -> [H, W, 3] scene-linear Rec.709 radiance, >= 0, not multiplied by an exposure time.
         base_time: Seconds at 0 EV.
-        evs: Stops, such as "-4,-2,0" or [-4, -2, 0]. Give either evs or exposures.
+        evs: Stops, such as "-4,-2,0" or [-4, -2, 0]. Set either evs or exposures.
         exposures: Seconds, stops or multiples of the base time, such as "1/125, -2ev, 8x"; numbers are seconds.
         cameras: Camera of each view by name, for the EXR attributes.
         colorspace: Primaries of the EXR files.
@@ -243,8 +243,8 @@ class BracketWriter:
         digits = len(str(len(pixels) - 1))  # Tools sort files by name.
         for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
             label = f"b{index:0{digits}d}_{exposure.label}"
-            header = self.header.attributes(exposure.time, camera, view=name, ev=repr(exposure.ev)) | reason
-            parts.append(Part(rgb_channels(image), header, label if self.multipart else ""))
+            attributes = self.header.attributes(exposure.time, camera, view=name, ev=repr(exposure.ev)) | reason
+            parts.append(Part(rgb_channels(image), attributes, label if self.multipart else ""))
             place = f"{name}/{name}_{label}" if self.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if self.multipart else f"{place}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}

@@ -116,24 +116,22 @@ class Render:
 
 def run_render(args: Render) -> None:
     """Run `sehdr-warp render`."""
-    from .images.colorspace import color_space
-
-    color_space(args.pictures.colorspace)  # Before anything is loaded
+    _check_render(args)
+    ramp = _ramp(args.film.ev_ramp)
     from .cameras.selection import select_cameras
     from .film import write_film
     from .render_views import render_views
     from .world_transform import world_transform
 
-    _check_render(args)
-    ramp = _ramp(args.film.ev_ramp)
     run = open_scene(args.run, args.device)
     default_count = _FILM_VIEWS if args.out is None else _PICTURE_VIEWS
     count = default_count if args.count is None else args.count
     selection = {"cameras": args.cameras, "camera": args.camera, "count": count, "size": args.size}
     files, fps, summary = [], args.film.fps, ""
     if args.out is not None:
-        groups = vars(args.world) | vars(args.pictures)  # Their fields are arguments of render_views().
-        files = render_views(run, args.out, overwrite=args.overwrite, fps=fps, **selection, **groups)
+        # The fields of these groups of options are arguments of render_views().
+        options = vars(args.world) | vars(args.pictures)
+        files = render_views(run, args.out, overwrite=args.overwrite, fps=fps, **selection, **options)
         summary = f"{args.out}: {len(files)} files"
     if args.video is not None:
         transform = world_transform(run, **vars(args.world))
@@ -152,6 +150,9 @@ def _check_render(args: Render) -> None:
 
     Raises UsageError or SehdrError for options that do not fit each other or are out of range.
     """
+    from .images.colorspace import color_space
+
+    color_space(args.pictures.colorspace)  # Before modules that take long to load
     from .cameras.selection import PATHS, may_move
     from .film import check_rate, film_format, film_library
     from .render_views import check_options
@@ -166,8 +167,9 @@ def _check_render(args: Render) -> None:
         raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
     if args.out is None and (flags := changed_flags(args.pictures)):
         raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
-    colors = "reference_white", "colorspace"
-    check_options(args.cameras, args.size, **{k: v for k, v in vars(args.pictures).items() if k not in colors})
+    # Without the reference white, which needs the scene, and the color space, see above
+    pictures = {k: v for k, v in vars(args.pictures).items() if k not in ("reference_white", "colorspace")}
+    check_options(args.cameras, args.size, **pictures)
     if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
     check_rate(args.film.fps)

@@ -64,8 +64,7 @@ def merge_scenes(run: RenderableScene, *others: RenderableScene) -> MergedScene:
             of another one is not known, which would have to be included in its sizes.
     """
     refuse_paths("load_run", run, *others)
-    scenes = (run, *others)
-    return MergedScene(scenes)
+    return MergedScene((run, *others))
 
 
 def _to_coordinates_of(first: RenderableScene, scene: RenderableScene) -> WorldTransform:

@@ -1,12 +1,10 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from ..errors import SehdrError, refuse_paths
 from ..files import atomic_folder, atomic_path
@@ -110,7 +108,7 @@ def render_views(
     refuse_paths("load_run", run)
     options = {"multipart": multipart, "ldr_brackets": ldr_brackets, "group_by": group_by, "ocio": ocio, "view": view}
     check_options(cameras, size, aovs=aovs, evs=evs, exposures=exposures, pixel=pixel, **options)
-    out = Path(out)
+    out, aov_names = Path(out), read_aovs(aovs)
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, size=size, transform=transform, up=up)
     camera_files = _camera_files(run, views, transform, fps, moves=may_move(cameras))
@@ -128,17 +126,10 @@ def render_views(
             response=run.response,
             group_by=group_by,
         )
-        times = [entry.exposure_time for entry in run.cameras if entry.split == "train"] or [run.base_time]
-        if max(times) > _SAME_EXPOSURE * min(times):
-            corrected = run.exposure_compensation is not None  # base_time is the median of corrected times.
-            median = "median exposure" + " corrected for drift" * corrected
-            text = "0 EV of the brackets is %s, the photos' %s; their times are %s to %s"
-            log.info(text, shutter(run.base_time), median, shutter(min(times)), shutter(max(times)))
-    to_display: Callable[[np.ndarray], np.ndarray] | None = None
-    if ocio is not None and view is not None:
-        to_display = ocio_view(ocio, view, exposure_of_white(run, 1.0))
-    aov_names, empty = read_aovs(aovs), []
-    with ExitStack() as stack:  # Closed in reverse order: brackets take their place first, cameras last.
+        _log_base_exposure(run)
+    to_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
+    empty = []
+    with ExitStack() as stack:  # What is entered first takes its place last: brackets do so before cameras.
         for name, text in camera_files.items():
             stack.enter_context(atomic_path(out / name, overwrite)).write_text(text, encoding="utf-8")
         hdr_folder = stack.enter_context(atomic_folder(out / "hdr", overwrite))
@@ -199,16 +190,6 @@ def check_options(
         raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
 
 
-def _hdr_parts(
-    images: ViewImages, attributes: Mapping[str, Any], colorspace: str, exposure: float, aovs: Sequence[str]
-) -> list[Part]:
-    """Return the parts of a file of `hdr/`: the picture, whose colors are radiance times exposure, and its AOVs."""
-    channels = rgb_channels(from_rec709(images.hdr, colorspace) * exposure) | {"A": images.alpha, "Z": images.depth}
-    if images.confidence is not None:
-        channels["confidence"] = images.confidence
-    return [Part(channels, attributes, "rgba" if aovs else ""), *data_parts(aovs, images, attributes)]
-
-
 def _camera_files(
     run: "RenderableScene", views: Sequence[tuple[str, Camera]], transform: WorldTransform, fps: float, *, moves: bool
 ) -> dict[str, str]:
@@ -233,8 +214,28 @@ def _camera_files(
     return files
 
 
+def _log_base_exposure(run: "RenderableScene") -> None:
+    """Log what 0 EV of brackets is if the photos have several exposure times."""
+    times = [entry.exposure_time for entry in run.cameras if entry.split == "train"] or [run.base_time]
+    if max(times) > _SAME_EXPOSURE * min(times):
+        # base_time is the median of corrected times.
+        median = "median exposure" + " corrected for drift" * (run.exposure_compensation is not None)
+        text = "0 EV of the brackets is %s, the photos' %s; their times are %s to %s"
+        log.info(text, shutter(run.base_time), median, shutter(min(times)), shutter(max(times)))
+
+
 def shared_tone_map(run: "RenderableScene", cameras: Sequence[Camera]) -> ToneMap:
     """Return one tone map for all pictures of some cameras, fitted to a few small renders."""
     small = [camera.within(_FIT_SIZE) for camera in evenly(cameras, _FIT_VIEWS)]
     renders = [run.render(camera, average=False) for camera in small]
     return fit_tone_map([as_array(each.hdr) for each in renders], [as_array(each.alpha) for each in renders])
+
+
+def _hdr_parts(
+    images: ViewImages, attributes: Mapping[str, Any], colorspace: str, exposure: float, aovs: Sequence[str]
+) -> list[Part]:
+    """Return the parts of a file of `hdr/`: the picture, whose colors are radiance times exposure, and its AOVs."""
+    channels = rgb_channels(from_rec709(images.hdr, colorspace) * exposure) | {"A": images.alpha, "Z": images.depth}
+    if images.confidence is not None:
+        channels["confidence"] = images.confidence
+    return [Part(channels, attributes, "rgba" if aovs else ""), *data_parts(aovs, images, attributes)]

@@ -110,10 +110,8 @@ def write_scene_page(
         data_block(_pack(values[3:].astype("<f2")), id="rest"),
     ]
     body = page_markup("scene.html", title=run.scene_name, data=join(blocks, "\n"))
-    scripts = [
-        page_file("playcanvas.min.js"),
-        "".join(map(page_file, ("tables.js", "light.js", "camera.js", "scene.js"))),
-    ]
+    own = "".join(map(page_file, ("tables.js", "light.js", "camera.js", "scene.js")))
+    scripts = [page_file("playcanvas.min.js"), own]
     page = whole_page(run.scene_name, page_file("scene.css"), body, scripts, workers=True)
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(page, encoding="utf-8")

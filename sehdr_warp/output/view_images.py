@@ -48,44 +48,45 @@ def render_images(
 
     Raises SehdrError if one of the AOVs was not measured for the run.
     """
-    view = run.render(camera)
-    measured = {
-        "confidence": run.render_confidence(camera),
-        "clipped": run.render_clipped(camera) if "clipped" in aovs else None,
-    }
-    for name, values in measured.items():
+    rendered, confidence = run.render(camera), run.render_confidence(camera)
+    clipped = run.render_clipped(camera) if "clipped" in aovs else None
+    for name, values in (("confidence", confidence), ("clipped", clipped)):
         if values is None and name in aovs:
             remedy = "`sehdr-warp report` measures it for a run, from the photos; else leave the AOV out"
             raise SehdrError(f"{run.path}: AOV {name} was not measured; {remedy}")
-    hdr, alpha, depth = (as_array(values) for values in (view.hdr, view.alpha, view.depth))
-    depth = depth * np.float32(transform.scale)
-    measured = {name: None if values is None else as_array(values) for name, values in measured.items()}
-    return ViewImages(transform.camera(camera), hdr, alpha, depth, **measured)
+    return ViewImages(
+        transform.camera(camera),
+        as_array(rendered.hdr),
+        as_array(rendered.alpha),
+        as_array(rendered.depth) * np.float32(transform.scale),
+        confidence=None if confidence is None else as_array(confidence),
+        clipped=None if clipped is None else as_array(clipped),
+    )
 
 
 Channels = Mapping[str, Any]
 
 
-def _depth(view: ViewImages) -> Channels:
+def _depth(images: ViewImages) -> Channels:
     """Return Z and the distance from the camera; 0 where nothing is."""
-    depth = view.depth
-    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(view.camera), axis=2)}
+    depth = images.depth
+    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(images.camera), axis=2)}
 
 
-def _position(view: ViewImages) -> Channels:
-    points = _points(view)
+def _position(images: ViewImages) -> Channels:
+    points = _points(images)
     return {f"position.{axis}": points[..., i] for i, axis in enumerate("XYZ")}
 
 
-def _normals(view: ViewImages) -> Channels:
+def _normals(images: ViewImages) -> Channels:
     """Return surface normals from depth, towards the camera, in the file's axes; 0 where empty and at borders."""
-    points = _points(view)
+    points = _points(images)
     down, right = (np.gradient(points, axis=axis) if points.shape[axis] > 1 else 0 * points for axis in (0, 1))
     normal = np.cross(down, right)
-    normal *= np.where((normal * (view.camera.position - points)).sum(2, keepdims=True) < 0, -1, 1)
+    normal *= np.where((normal * (images.camera.position - points)).sum(2, keepdims=True) < 0, -1, 1)
     length = np.linalg.norm(normal, axis=2, keepdims=True)
     # A difference with an empty pixel has no meaning.
-    covered = view.depth > 0
+    covered = images.depth > 0
     whole = np.pad(covered, 1)
     whole = whole[1:-1, 1:-1] & whole[:-2, 1:-1] & whole[2:, 1:-1] & whole[1:-1, :-2] & whole[1:-1, 2:]
     normal = np.where(whole[..., None] & (length > 0), normal / np.where(length > 0, length, 1), 0)
@@ -96,9 +97,9 @@ AOVS: Mapping[str, Callable[[ViewImages], Channels]] = {
     "depth": _depth,
     "position": _position,
     "normals": _normals,
-    "alpha": lambda view: {"A": view.alpha},
-    "confidence": lambda view: {"confidence": view.confidence},
-    "clipped": lambda view: {"clipped": view.clipped},
+    "alpha": lambda images: {"A": images.alpha},
+    "confidence": lambda images: {"confidence": images.confidence},
+    "clipped": lambda images: {"clipped": images.clipped},
 }
 
 
@@ -111,8 +112,7 @@ def read_aovs(names: str | Sequence[str]) -> tuple[str, ...]:
     requested = [name.strip() for name in names.split(",") if names] if isinstance(names, str) else list(names)
     for name in requested:
         if name not in AOVS and name != "all":
-            names_text = ", ".join(AOVS)
-            raise SehdrError(f"AOV {name!r} is not one of {names_text}, all{did_you_mean(name, AOVS)}")
+            raise SehdrError(f"AOV {name!r} is not one of {', '.join(AOVS)}, all{did_you_mean(name, AOVS)}")
     if "all" in requested:
         return tuple(AOVS)
     if len(set(requested)) < len(requested):
@@ -120,9 +120,9 @@ def read_aovs(names: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(requested)
 
 
-def data_parts(names: Sequence[str], view: ViewImages, header: Mapping[str, Any]) -> list[Part]:
-    """Return the parts of a file that hold AOVs of a rendered view; `header` is that of its picture."""
-    return [Part(AOVS[name](view), as_data(header), name) for name in names]
+def data_parts(names: Sequence[str], images: ViewImages, attributes: Mapping[str, Any]) -> list[Part]:
+    """Return the parts of a file that hold AOVs of a rendered view; `attributes` are those of its picture."""
+    return [Part(AOVS[name](images), as_data(attributes), name) for name in names]
 
 
 def _rays(camera: Camera) -> np.ndarray:
@@ -133,8 +133,8 @@ def _rays(camera: Camera) -> np.ndarray:
     return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2)
 
 
-def _points(view: ViewImages) -> np.ndarray:
+def _points(images: ViewImages) -> np.ndarray:
     """Return [H, W, 3] coordinates of the visible surface in the file; 0 where nothing is."""
-    camera, depth = view.camera, view.depth[..., None]
+    camera, depth = images.camera, images.depth[..., None]
     points = (_rays(camera) * depth) @ camera.world_to_camera[:3, :3] + camera.position
     return np.where(depth > 0, points, 0)
