@@ -1,4 +1,4 @@
-"""The paths that clients ask for, refused requests, and scenes as a client's save renders them."""
+"""Requests of clients: their paths, refusals, and a run while files of it are saved for a client."""
 
 import ipaddress
 import re
@@ -33,7 +33,7 @@ def is_local(host: str) -> bool:
         return host == "localhost" or host.endswith(".localhost")
 
 
-class SavedRun:
+class ClientRun:
     """A run while a client saves files: the renderer's thread renders pictures, until the client disconnects."""
 
     def __init__(

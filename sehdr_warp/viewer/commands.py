@@ -69,4 +69,4 @@ def run_view(args: View) -> None:
             log.info("the viewer has ended")
         watch.stop()
         for run in watch.scenes:  # What is being rendered is waited for: kernels must not outlive Python.
-            run.lock.close(timeout=30)
+            run.lock.block(timeout=30)

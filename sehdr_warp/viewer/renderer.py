@@ -20,11 +20,11 @@ class Renderer:
     small pictures beside a large one.
     """
 
-    def __init__(self, beside: bool = False) -> None:
-        """Start the threads; `beside`: one more for small pictures, on a CPU, where a large one takes seconds."""
+    def __init__(self, second_thread: bool = False) -> None:
+        """Start the threads; second_thread: one more for small pictures, on a CPU, where a large one takes seconds."""
         self._waiting: list[_Picture] = []
         self._changed, self._closed, self._numbers = threading.Condition(), False, count()
-        names = ["sehdr-warp viewer renders", *["sehdr-warp viewer renders small"] * beside]
+        names = ["sehdr-warp viewer renders", *["sehdr-warp viewer renders small"] * second_thread]
         self._threads = [
             threading.Thread(target=self._run, args=(number > 0,), name=name, daemon=True)
             for number, name in enumerate(names)

@@ -28,7 +28,7 @@ class SceneLock:
     @contextmanager
     def changing(self) -> Iterator[None]:
         """Wait until nobody renders or changes the scene, and keep others away from it."""
-        self.close()
+        self.block()
         try:
             yield
         finally:
@@ -36,7 +36,7 @@ class SceneLock:
                 self._changing = False
                 self._changed.notify_all()
 
-    def close(self, timeout: float | None = None) -> None:
+    def block(self, timeout: float | None = None) -> None:
         """Wait until nobody renders or changes the scene, for at most `timeout` seconds, and let nobody begin."""
         with self._changed:
             self._changed.wait_for(lambda: not self._changing, timeout)

@@ -28,7 +28,7 @@ from ..output.images.ldr_files import quantize
 from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
-from .clients import Refusal, SavedRun, is_local, own_path
+from .clients import ClientRun, Refusal, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, orient
 from .frames import ViewerScene, camera_file, camera_of, frame_bytes
@@ -65,17 +65,14 @@ class Viewer:
         photos: returns the views of a run by name, and reads them on first use; raises SehdrError if they are gone.
         training: a LiveTraining, if one runs.
         """
-        self.runs, self.training, self.saving = list(runs), training, ""
-        self._photos, self._reading, self._saving = photos, threading.Lock(), threading.Lock()
-        self._renderer = Renderer(beside=training is None and all(run.on_cpu for run in self.runs))
+        self.runs, self.training, self.save_line = list(runs), training, ""
+        self._photos, self._photo_lock, self._save_lock = photos, threading.Lock(), threading.Lock()
+        self._renderer = Renderer(second_thread=training is None and all(run.on_cpu for run in self.runs))
         self._closed = threading.Event()
         page = Path(__file__).parent / "page"
         self.files = {
             "/": ("text/html", page.joinpath("viewer.html").read_text(encoding="utf-8")),
-            "/viewer.css": (
-                "text/css",
-                page_file("style.css") + page.joinpath("viewer.css").read_text(encoding="utf-8"),
-            ),
+            "/viewer.css": ("text/css", page_file("style.css") + (page / "viewer.css").read_text(encoding="utf-8")),
             **{f"/{name}": ("text/javascript", page_file(name)) for name in ("tables.js", "light.js", "camera.js")},
             "/viewer.js": ("text/javascript", page.joinpath("viewer.js").read_text(encoding="utf-8")),
         }
@@ -93,7 +90,7 @@ class Viewer:
         if path == "/training" and self.training is not None:
             return "application/json", json.dumps(self.training.progress()).encode()
         if path == "/saving":
-            return "text/plain", self.saving.encode()
+            return "text/plain", self.save_line.encode()
         if path.startswith("/photo/"):
             return "image/png", self._photo(path.removeprefix("/photo/"), client)
         raise Refusal(404, "no such page")
@@ -105,24 +102,24 @@ class Viewer:
             return "application/json", b"{}"
         if path == "/frame":
             options = {name: bool(request.get(name)) for name in ("draft", "clipped")}
-            run, camera = self._run(request), camera_of(request["camera"])
+            run, camera = self._run_of(request), camera_of(request["camera"])
             client.reserve(frame_bytes(camera, options["clipped"]))
             parts, pixels, frame = run.frame_parts(camera, **options), camera.width * camera.height, None
             while frame is None:
                 frame = self.on_renderer(client, partial(next, parts), pixels)
             return "application/octet-stream", frame
         if path in ("/edit", "/orientation") and self.training is None:
-            run = self._run(request)
+            run = self._run_of(request)
             if path == "/edit":
                 edits = edits_of(request, partial(self._photos_of, int(request.get("run", 0))))
-                merged = [self._run({"run": index}) for index in request.get("merge", ())]
+                merged = [self._run_of({"run": index}) for index in request.get("merge", ())]
                 self.on_renderer(client, partial(run.edit, edits, merged))
             else:
                 self.on_renderer(client, partial(orient, run, request))
             run.version += 1  # Pages read up and scale again.
             return "application/json", json.dumps(run.facts()).encode()
         if path in ("/lights", "/gain") and self.training is None:
-            run = self._run(request)
+            run = self._run_of(request)
             if path == "/gain":
                 light, stops = int(request["light"]), float(request["stops"])
                 self.on_renderer(client, partial(run.set_gain, light, stops))
@@ -134,16 +131,16 @@ class Viewer:
             if request.get("count"):
                 cameras = interpolate(cameras, min(int(request["count"]), MOST_VIEWS))
             if path == "/path":
-                return "application/json", camera_file(self._run(request), cameras).encode()
-            saved = SavedRun(self.on_renderer, self._run(request), client)
-            return self._save(saved, cameras, str(request["kind"]), request)
+                return "application/json", camera_file(self._run_of(request), cameras).encode()
+            client_run = ClientRun(self.on_renderer, self._run_of(request), client)
+            return self._save(client_run, cameras, str(request["kind"]), request)
         raise Refusal(404, "no such page")
 
     def close(self) -> None:
         """End the work for clients, and wait for it: native code must not run while Python ends."""
         self._closed.set()
         self._renderer.close()
-        for lock in (self._saving, self._reading):
+        for lock in (self._save_lock, self._photo_lock):
             if lock.acquire(timeout=_SAVE_END):
                 lock.release()
 
@@ -165,7 +162,7 @@ class Viewer:
                 raise ClientGone from None
             raise
 
-    def _run(self, request: dict) -> ViewerScene:
+    def _run_of(self, request: dict) -> ViewerScene:
         index = int(request.get("run", 0))
         if not 0 <= index < len(self.runs):
             raise Refusal(404, "no such run")
@@ -173,35 +170,36 @@ class Viewer:
 
     def _photos_of(self, index: int) -> list[Any]:
         """Return the photos of a run; raise SehdrError if they are gone."""
-        with self._reading:
+        with self._photo_lock:
             return list(self._photos(index).values())
 
     def _photo(self, name: str, client: Connection) -> bytes:
         """Return the photo of a run and a view by their indices, as PNG."""
-        run, _, view = name.partition("/")
-        if not (run.isascii() and view.isascii() and run.isdigit() and view.isdigit() and len(name) < 20):
+        index, _, view = name.partition("/")
+        if not (index.isascii() and view.isascii() and index.isdigit() and view.isdigit() and len(name) < 20):
             raise Refusal(404, "no such photo")
-        entries = self._run({"run": run}).cameras
-        if int(view) >= len(entries):
+        run = self._run_of({"run": index})
+        if int(view) >= len(run.cameras):
             raise Refusal(404, "no such photo")
-        with self._reading:  # One at a time, because pictures of a large photo take much memory on the way.
-            photo = self._photos(int(run)).get(entries[int(view)].name)
+        with self._photo_lock:  # One at a time, because pictures of a large photo take much memory on the way.
+            photo = self._photos(int(index)).get(run.cameras[int(view)].name)
             if photo is None or self._closed.is_set():
                 raise Refusal(404, "no such photo")
             buffer = io.BytesIO()
-            picture = Image.fromarray(quantize(photo_for_display(cast(Any, self._run({"run": run})), photo)))
+            picture = Image.fromarray(quantize(photo_for_display(cast(Any, run), photo)))
             picture.save(buffer, "PNG", compress_level=1)
         client.reserve(buffer.tell())
         return buffer.getvalue()
 
     def _save(self, run: Any, cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
-        """Return files of cameras of a SavedRun, as `render` writes them: EXR, a zip of brackets and all, or a film."""
-        stops, evs = _stops(request), str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
+        """Return the type and content of what a client saves: EXR, a zip of what `render` writes, a film or a page."""
+        stops = _stops(request)
+        evs = str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
         pictures = len(evs.split(",")) + 1 if evs else 1
         pixels = pictures * sum(camera.width * camera.height for camera in cameras)
         if kind != "film" and pixels > MOST_SAVED:
             raise Refusal(413, f"{pixels} pixels are more than the {MOST_SAVED} of a save; use sehdr-warp render")
-        if not self._saving.acquire(blocking=False):
+        if not self._save_lock.acquire(blocking=False):
             raise Refusal(503, "another save is still being made")
         try:
             with tempfile.TemporaryDirectory() as folder:
@@ -224,12 +222,12 @@ class Viewer:
                 run.client.reserve(packed.stat().st_size)
                 return "application/zip", packed.read_bytes()
         finally:
-            self.saving = ""
-            self._saving.release()
+            self.save_line = ""
+            self._save_lock.release()
 
     def _tell(self, line: str) -> None:
         """Set the line that a page shows while a film is rendered."""
-        self.saving = line
+        self.save_line = line
 
 
 def _stops(request: dict) -> float:

@@ -35,8 +35,8 @@ class Watch(threading.Thread):
 
     def look(self) -> None:
         """Load again the scenes whose files have changed."""
-        for index, rendering in enumerate(self.scenes):
-            path, last_state = Path(rendering.name), self._states[index]
+        for index, scene in enumerate(self.scenes):
+            path, last_state = Path(scene.name), self._states[index]
             self._states[index] = state = _state(path)
             if state == last_state:
                 continue
@@ -44,7 +44,7 @@ class Watch(threading.Thread):
                 if not state:
                     raise SehdrError(f"{path}: has vanished")
                 run = self._load(path)
-                rendering.replace(run, run.clipped_share())
+                scene.replace(run, run.clipped_share())
             except SehdrError as error:
                 log.warning("%s; the viewer keeps what it has read", error)
             else:

@@ -9,7 +9,7 @@ import pytest
 
 from sehdr_warp import load_run
 from sehdr_warp.viewer import connections
-from sehdr_warp.viewer.clients import SavedRun
+from sehdr_warp.viewer.clients import ClientRun
 from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import MOST_SAVED, Server
 
@@ -106,7 +106,7 @@ def test_a_save_ends_when_its_client_leaves(serve, kind):
     until(lambda: run.renders > 1)
     assert ask(server, "/save", {"cameras": [small], "kind": "exr"})[0] == 503
     client.close()
-    until(lambda: not server.viewer._saving.locked())
+    until(lambda: not server.viewer._save_lock.locked())
     assert run.renders < 1000
     assert ask(server, "/save", {"cameras": [small], "kind": "exr"})[0] == 200
 
@@ -120,7 +120,7 @@ def test_the_end_of_the_server_ends_a_save(serve):
     server.shutdown()
     started = time.monotonic()
     server.server_close()
-    assert time.monotonic() - started < 10 and not server.viewer._saving.locked() and run.renders < 1000
+    assert time.monotonic() - started < 10 and not server.viewer._save_lock.locked() and run.renders < 1000
     client.close()
 
 
@@ -159,8 +159,8 @@ def test_a_small_save_that_is_averaged_waits_as_a_picture_of_its_finer_pixels(em
         sizes.append(pixels)
         return make()
 
-    saved, photo = SavedRun(on_renderer, ViewerScene(run, "run"), None), run.cameras[0].camera
+    client_run, photo = ClientRun(on_renderer, ViewerScene(run, "run"), None), run.cameras[0].camera
     small = photo.resized(photo.width // 2, photo.height // 2)
     for average in (True, False):
-        assert saved.render(small, average=average).hdr.shape == (small.height, small.width, 3)
+        assert client_run.render(small, average=average).hdr.shape == (small.height, small.width, 3)
     assert sizes == [4 * small.width * small.height, small.width * small.height]

@@ -29,7 +29,7 @@ def test_small_pictures_go_first_and_large_ones_get_their_turn():
 
 
 def test_a_small_picture_is_made_beside_a_large_one():
-    renderer, begun, end = Renderer(beside=True), threading.Event(), threading.Event()
+    renderer, begun, end = Renderer(second_thread=True), threading.Event(), threading.Event()
 
     def large():
         begun.set()

@@ -29,7 +29,7 @@ def test_several_render_and_one_changes_alone():
         assert not rendered.wait(0.1), "who comes later waits for the change"
     assert changed.wait(10) and rendered.wait(10)
     changer.join(10)
-    lock.close(timeout=1)
+    lock.block(timeout=1)
     threading.Thread(target=render, daemon=True).start()
     rendered.clear()
     assert not rendered.wait(0.1)
