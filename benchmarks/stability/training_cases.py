@@ -17,9 +17,9 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import Scene
 from sehdr_warp.training.initialization import make_field
 from sehdr_warp.training.losses import data_loss, opacity_loss
-from sehdr_warp.training.targets import PhotoSource
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import state_of
+from sehdr_warp.training.training_views import ViewDataset
 
 STEPS, SIZE = 40, 32
 RATES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
@@ -70,7 +70,7 @@ def _learning_rates(device):
 def _gradient_norms(device):
     """Finite, and none drowns the photo's by 1e4."""
     field = _trainer(device).field
-    view = PhotoSource(_photos().train_views, field.base_time, device, truth=False)[0]
+    view = ViewDataset(_photos().train_views, field.base_time, device, truth=False)[0]
     norms, broken = {}, 0
     for name, ssim, opacity in (("L1", 0.0, 0.0), ("L1 and SSIM", 0.2, 0.0), ("opacity", 0.0, 0.01)):
         config = load_config("default", {"loss.ssim_weight": ssim, "loss.opacity_weight": opacity}).loss

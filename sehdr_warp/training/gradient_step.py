@@ -27,7 +27,7 @@ from .optimizer import FlatGradients
 from .ranks import Ranks
 from .scene_facts import largest_hdr_truth
 from .strategies import SEED_STRIDE, Strategy
-from .targets import TrainingView
+from .training_views import TrainingView
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from ..scene import Camera, View, codes_of
 from ..splats.arrays import HARMONIC_0
 from .strategies import Proposals
 from .strategies.mcmc import MAX_DISTANCE
-from .targets import TrainingView
+from .training_views import TrainingView
 
 WHITE_TOLERANCE = 1e-4  # Of values of the harmonics' constant part that are compared with that of white
 LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels

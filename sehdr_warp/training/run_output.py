@@ -187,7 +187,7 @@ def estimated_light(run: Run, evidence: Evidence) -> float:
 def remove_unseen(trainer: Trainer) -> Evidence:
     """Remove the Gaussians that no training photo shows; return the evidence of the photos for the others."""
     views, truth = trainer.scene.train_views, trainer.config.loss.uses_hdr
-    estimates = None if truth else trainer.views.light_estimates
+    estimates = None if truth else trainer.data_manager.light_estimates
     certainties = None if estimates is None else [estimate.certainty for estimate in estimates]
     evidence = gather_evidence(trainer.field, views, degree=trainer.degree, truth=truth, certainties=certainties)
     count, contributes = trainer.field.gaussians.count, evidence.contributes

@@ -15,7 +15,7 @@ from ..scene.images.ldr_files import file_kind
 from ..scene.wide_camera import perspective_views
 from ..subsets import every_nth
 from .initialization import focus_distance, points_on_rays
-from .targets import pixel_bytes
+from .training_views import pixel_bytes
 
 _REMEDY = "take a scene with HDR truth, or a preset that needs none"
 

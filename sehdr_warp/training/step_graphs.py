@@ -15,9 +15,9 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..rasterizer import CudaGraphRunner
 from ..rasterizer.memory import failed_allocation
+from .data_manager import DeviceViews, PhotoStream
 from .gradient_step import GradientStep, GraphKey, StepOptions, StepResult
-from .targets import ViewStack
-from .training_views import PhotoStream, ViewSource
+from .training_views import ViewStack
 
 HEADROOM = 1.25  # Capacity as a multiple of the largest count; the photos of a scene differ by a factor of up to 1.32
 MIN_HEADROOM = 1.08  # After densification, a capacity below this multiple of the expected count is replaced
@@ -49,7 +49,7 @@ class StepGraphs:
         self._eager_keys: set[GraphKey] = set()
 
     def run(
-        self, views: ViewSource, index: int, following: int | None, options: StepOptions, iteration: int
+        self, views: DeviceViews, index: int, following: int | None, options: StepOptions, iteration: int
     ) -> StepResult:
         """Do GradientStep.run() on view `index`; if photos are streamed, fetch view `following` at the same time."""
         step, gaussians = self._step, self._step.field.gaussians
@@ -67,7 +67,7 @@ class StepGraphs:
             self._eager_keys.add(key)
         return result
 
-    def can_replay(self, views: ViewSource, key: GraphKey | None) -> TypeGuard[ViewStack | PhotoStream]:
+    def can_replay(self, views: DeviceViews, key: GraphKey | None) -> TypeGuard[ViewStack | PhotoStream]:
         """Return whether a step can be captured: an index on the device selects its photo, and its kernels are loaded.
 
         Kernels are loaded when they first run, so the first step of a key runs without a graph.

@@ -155,7 +155,7 @@ def _new_trainer(
     get_matcher = cache(lambda: matcher or make_matcher(normalization.scene(photos), response, device))
     field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
     trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks)
-    light = trainer.views.clipped_light_targets  # Estimated once, for this and for the loss.
+    light = trainer.data_manager.clipped_light_targets  # Estimated once, for this and for the loss.
     if light is not None and not config.model.init_file:
         brighten_clipped(field, normalization.scene(photos).train_views, light)
     trainer.seconds = time.perf_counter() - started

@@ -28,6 +28,7 @@ from ..runs.config import Config
 from ..runs.run import Run, as_rec709
 from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
+from .data_manager import DataManager, PhotoSampler
 from .gradient_step import GradientStep, StepOptions, StepResult
 from .initialization import make_matcher, sizes_of
 from .losses import INTERVALS_FROM
@@ -40,7 +41,6 @@ from .scene_facts import is_large
 from .step_graphs import StepGraphs
 from .strategies import SEED_STRIDE, Proposals, make_strategy
 from .training_state import TrainingProgress
-from .training_views import PhotoOrder, TrainingViews
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ class Trainer:
         self.large_scene = is_large(scene) if large_scene is None else large_scene
         self.strategy = make_strategy(config, pixels, positions, large_scene=self.large_scene)
         self.average = MovingAverage(config, self.strategy.schedule.stop)
-        self.order = PhotoOrder(len(views), config.seed, rank, self.batch)
+        self.sampler = PhotoSampler(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         # Projected centers, which "adc" needs, and seeding are for pinhole photos alone.
         wide = next((view for view in views if not view.camera.is_pinhole), None)
@@ -125,7 +125,7 @@ class Trainer:
         self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, ranks, self.large_scene)
         use_cuda_graph = config.schedule.use_cuda_graph
         self.graphs = StepGraphs(self.gradient_step, enabled=use_cuda_graph, deterministic=config.deterministic)
-        self.views = TrainingViews(views, field, config, use_cuda_graph=self.graphs.enabled)
+        self.data_manager = DataManager(views, field, config, use_cuda_graph=self.graphs.enabled)
         self._result: StepResult | None = None  # Of the last step
         self._view_index = 0  # Training view of the last step
         # Why no further step follows: a signal, stop(), another rank that has ended
@@ -229,8 +229,8 @@ class Trainer:
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
         if self.iteration > INTERVALS_FROM * self.total:
-            self.views.use_code_intervals()
-        self._view_index = self.order.next()
+            self.data_manager.use_code_intervals()
+        self._view_index = self.sampler.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
         # The opacity loss ends with the refinements.
@@ -239,7 +239,8 @@ class Trainer:
         options = StepOptions(self.degree, opacity_weight, self.strategy.needs_gradients(self.iteration))
 
         # Forward, loss, backward, optimizer step: GradientStep.run().
-        self._result = self.graphs.run(self.views.source, self._view_index, self.order.peek(), options, self.iteration)
+        views, following = self.data_manager.views, self.sampler.peek()
+        self._result = self.graphs.run(views, self._view_index, following, options, self.iteration)
         # Densification.
         self.strategy.inject_noise(self.iteration, self.field.gaussians, means_lr)
         if self.strategy.is_due(self.iteration, self.step_batch):
@@ -272,7 +273,7 @@ class Trainer:
     def _propose_gaussians(self, number: Tensor, bound: int) -> Proposals:
         """Propose new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
         random_seed = self.config.seed * SEED_STRIDE + self.iteration
-        view, result = self.views.source[self._view_index], self._result
+        view, result = self.data_manager.views[self._view_index], self._result
         assert result is not None and self._get_matcher is not None
         with self.graphs.on_capture_stream():
             image = result.image
@@ -332,7 +333,7 @@ class Trainer:
     def psnr(self) -> float:
         """Return the PSNR of the last step's photo inside the mask, dB; rendering it does not count as training."""
         self.synchronize()
-        view = self.views.source[self._view_index]
+        view = self.data_manager.views[self._view_index]
         with self.graphs.on_capture_stream():
             photo = self.field.render_train_view(view.camera, view.exposure_time, degree=self.degree).encoded
         assert photo is not None

@@ -24,7 +24,7 @@ def state_of(trainer: Trainer) -> Checkpoint:
         "densification": trainer.strategy.state_dict(field.gaussians.count),
         "average": trainer.average.means,
     }
-    order, remaining = trainer.order.state()
+    order, remaining = trainer.sampler.state()
     parts["generators"] = {"order": order, "device": trainer.generator.get_state()}
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
     counts = {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
@@ -46,7 +46,7 @@ def load_state(trainer: Trainer, state: Checkpoint) -> None:
         for total in statistics.values():
             total.zero_()
     generators = under(tensors, "generators.")
-    trainer.order.load_state(generators["order"], values["order"])
+    trainer.sampler.load_state(generators["order"], values["order"])
     if trainer.generator.get_state().numel() == generators["device"].numel():
         trainer.generator.set_state(generators["device"].cpu())
     trainer.iteration = trainer.first_iteration = values["iteration"]

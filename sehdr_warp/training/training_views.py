@@ -1,236 +1,158 @@
-"""The training views: the order in which steps take them, and the form in which they lie on the device.
+"""Training views: cameras and targets on the device, stacked for captured steps or uploaded one by one."""
 
-If the device has no memory for all photos, steps read theirs from one of a few slots. A thread copies the next photo,
-from memory or a mapped file, to pinned memory and from there to the device on a stream of its own, while the step
-before it runs.
-"""
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
-import logging
-import operator
-from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
-from functools import cached_property
-
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from ..limits import format_bytes
-from ..model.radiance_field import RadianceField
 from ..model.renders import CameraTensors
-from ..runs.config import Config
-from ..runs.light_estimates import ClippedLight, light_estimates
+from ..rasterizer.losses.code_residual import code_tensor
+from ..response import Response
 from ..scene import View
-from .losses import compares_exposures
-from .targets import PhotoSource, Target, TrainingView, ViewStack, select_view
-
-log = logging.getLogger(__name__)
-
-SLOTS = 3  # One is read, one is filled, and one may still be read by a step that has not finished
-MAX_MEMORY_PART = 0.4  # Of the device's free memory for photos; stacking them takes as much again for a while
+from .targets import Target, code_scale, select_view
 
 
-class PhotoOrder:
-    """The order of `count` photos; all ranks draw the same order, and each takes its own photo of a step."""
+@dataclass(frozen=True)
+class TrainingView:
+    """A photo to train on: what a step gets."""
 
-    def __init__(self, count: int, seed: int, rank: int = 0, ranks: int = 1):
-        """Create an order of `count` photos for process `rank` of `ranks`."""
-        self._count, self._rank, self._ranks = count, rank, ranks
-        self._remaining: list[int] = []
-        self._generator = torch.Generator().manual_seed(seed)
-
-    def next(self) -> int:
-        """Return the index of this rank's next photo."""
-        batch = []
-        for _ in range(self._ranks):
-            if not self._remaining:
-                self._remaining = torch.randperm(self._count, generator=self._generator).tolist()
-            batch.append(self._remaining.pop())
-        return batch[self._rank]
-
-    def peek(self) -> int | None:
-        """Return what next() will return, or None if a new order has to be drawn first."""
-        return self._remaining[-1 - self._rank] if self._rank < len(self._remaining) else None
-
-    def state(self) -> tuple[Tensor, list[int]]:
-        """Return the generator's state and the photos that remain of this order."""
-        return self._generator.get_state(), list(self._remaining)
-
-    def load_state(self, generator: Tensor, remaining: list) -> None:
-        """Continue from state(); raises ValueError if it names photos that do not exist."""
-        self._generator.set_state(generator.cpu())
-        self._remaining = [operator.index(photo) for photo in remaining]
-        if not all(0 <= photo < self._count for photo in self._remaining):
-            raise ValueError(f"the order of the photos names others than the {self._count} there are")
+    camera: CameraTensors  # Camera on the device
+    exposure_time: float | Tensor  # Seconds
+    target: Target  # The image to compare with, at the camera's size
 
 
-class PhotoStream:
-    """A replacement of ViewStack with SLOTS photos on the device.
+@dataclass(frozen=True)
+class ViewStack:
+    """V training views of one size in shared tensors: [i] is view i; at() selects by an index on the device."""
 
-    Call bring() for a view before at() returns it, and release() once the kernels that read it are launched. [i] is a
-    copy of view i, with the same values as in ViewStack: steps that are not captured read it.
-    """
+    width: int  # Pixels
+    height: int  # Pixels
+    cameras: Tensor  # [V, 24], each view's pose [4, 4], intrinsics [4], position [3] and a 0
+    times: Tensor | float  # Exposure times [V] in seconds, or one float if all are equal
+    targets: Target  # Target whose images are stacked, [V, ...]
 
-    def __init__(self, source: PhotoSource):
-        """Allocate the slots; raises ValueError if views differ in size, or only some have HDR truth."""
-        views, self._source, self._device = source.views, source, torch.device(source.device)
-        sizes = {(v.camera.width, v.camera.height, source.truth and v.hdr is not None) for v in views}
-        if len(sizes) > 1 or not all(view.camera.is_pinhole for view in views):
-            raise ValueError(
-                "photos differ in size, only some have HDR truth, or some are panoramas: no stack holds them"
-            )
-        self._cuda = self._device.type == "cuda"
-        examples = source.tensors(0)
-        if any(view.mask is not None for view in views):  # A view without a mask counts everywhere.
-            examples.setdefault("mask", torch.ones(*views[0].codes.shape[:2], 1))
-        self._slots = {name: t.new_zeros((SLOTS, *t.shape), device=self._device) for name, t in examples.items()}
-        pinned = self._slots if self._cuda else {}
-        self._pinned = {name: torch.zeros_like(t, device="cpu", pin_memory=True) for name, t in pinned.items()}
-        # Cameras of all views, without photos.
-        blank = Target(self._slots["codes"][0, :0, :0], source.scale)
-        cameras = [TrainingView(CameraTensors.of(v.camera, self._device), v.exposure_time, blank) for v in views]
-        stack = ViewStack.of(cameras)
-        assert stack is not None
-        self._cameras = stack
-        self._slot_index = torch.zeros(1, dtype=torch.int64, device=self._device)
-        self._slot_views: list[int | None] = [None] * SLOTS
-        self._filling: list[Future | None] = [None] * SLOTS
-        self._current = 0
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="sehdr-warp photos")
-        if self._cuda:
-            self._stream = torch.cuda.Stream(self._device)
-            self._filled, self._free = ([torch.cuda.Event() for _ in range(SLOTS)] for _ in range(2))
-            for event in self._free:  # The slots are free once they are zeroed, on this stream.
-                event.record(torch.cuda.current_stream(self._device))
+    @staticmethod
+    def of(views: Sequence[TrainingView]) -> "ViewStack | None":
+        """Stack views; returns None if their sizes differ, one is not a pinhole or only some have HDR truth."""
+        kinds = {(view.camera.width, view.camera.height, view.target.exposure_truth is None) for view in views}
+        if len(kinds) > 1 or any(view.camera.directions is not None for view in views):
+            return None
+        cameras, targets, times = zip(*((v.camera, v.target, v.exposure_time) for v in views), strict=True)
+        masks, truths = [t.mask for t in targets], [t.exposure_truth for t in targets]
+        if any(mask is not None for mask in masks):
+            # A view without a mask counts everywhere.
+            whole = torch.ones(cameras[0].height, cameras[0].width, 1, device=targets[0].codes.device)
+            masks = [whole if mask is None else mask for mask in masks]
+        # Rows of a multiple of 16 bytes, because kernels may read four floats at once.
+        rows = [torch.cat([c.world_to_camera.flatten(), c.intrinsics, c.position]) for c in cameras]
+        stacked = functional.pad(torch.stack(rows), (0, 1))
+        time = times[0] if len(set(times)) == 1 else torch.tensor(times, device=stacked.device)
+        mask, truth = (None if parts[0] is None else torch.stack(parts) for parts in (masks, truths))
+        estimates = None if targets[0].estimates is None else torch.stack([t.estimates for t in targets])
+        codes = torch.stack([t.codes for t in targets])
+        target = Target(codes, targets[0].scale, mask, truth, estimates=estimates)
+        return ViewStack(cameras[0].width, cameras[0].height, stacked, time, target)
 
     def __len__(self) -> int:
         """Return the number of views."""
-        return len(self._source)
+        return len(self.cameras)
 
     def __getitem__(self, index: int) -> TrainingView:
-        """Return a copy of a view on the device."""
-        view, tensors = self._cameras[index], self._source.tensors(index)
-        tensors = {name: tensor.to(self._device) for name, tensor in tensors.items()}
-        if "mask" in self._slots:  # Without a mask, the loss has other kernels, whose sums have other last bits.
-            tensors.setdefault("mask", torch.ones_like(self._slots["mask"][0]))
-        return replace(view, target=Target(scale=self._source.scale, **tensors))
-
-    @property
-    def times(self) -> Tensor | float:
-        """Exposure times, as in ViewStack."""
-        return self._cameras.times
+        """Return view `index` without copying its photo."""
+        time = float(self.times[index]) if isinstance(self.times, Tensor) else self.times
+        view = self._view(lambda values: values[index], time)
+        return replace(view, target=replace(view.target, codes=self.targets.codes[index]))
 
     def at(self, index: Tensor) -> TrainingView:
-        """Return the view whose number is in index [1], as in ViewStack; bring() must have been called for it."""
-        view = self._cameras.at(index)
-        parts = {name: select_view(slots, self._slot_index) for name, slots in self._slots.items() if name != "codes"}
-        return replace(view, target=replace(view.target, codes=self._slots["codes"], index=self._slot_index, **parts))
+        """Return the view whose number is in index [1], int64, on the views' device.
 
-    def bring(self, index: int) -> None:
-        """Make a view available to the kernels that are launched next."""
-        self._fetch(index)
-        self._current = slot = self._slot_views.index(index)
-        filling = self._filling[slot]
-        assert filling is not None
-        filling.result()
-        if self._cuda:
-            torch.cuda.current_stream(self._device).wait_event(self._filled[slot])
-        self._slot_index.fill_(slot)
+        The photo stays in the stack, because selecting it here would copy it; kernels select it by the index.
+        """
+        time = select_view(self.times, index) if isinstance(self.times, Tensor) else self.times
+        view = self._view(lambda values: select_view(values, index), time)
+        return replace(view, target=replace(view.target, index=index))
 
-    def release(self, following: int | None) -> None:
-        """Mark the view of bring() as read by launched kernels, and start to fetch the one that follows."""
-        if self._cuda:
-            self._free[self._current].record(torch.cuda.current_stream(self._device))
-        if following is not None:
-            self._fetch(following)
-
-    def _fetch(self, index: int) -> None:
-        """Start to fill a slot with a view unless one holds it."""
-        if index not in self._slot_views:
-            slot = (self._current + 1) % SLOTS
-            self._slot_views[slot] = index
-            self._filling[slot] = self._thread.submit(self._fill, slot, index)
-
-    def _fill(self, slot: int, index: int) -> None:
-        """Copy a view to its slot; runs on the thread."""
-        if self._cuda:
-            self._filled[slot].synchronize()  # The previous copy from pinned memory is done.
-        tensors = {"mask": torch.ones(())} | self._source.tensors(index)
-        for name, slots in (self._pinned or self._slots).items():
-            slots[slot].copy_(tensors[name])
-        if self._cuda:
-            with torch.cuda.stream(self._stream):
-                self._stream.wait_event(self._free[slot])
-                for name, slots in self._slots.items():
-                    slots[slot].copy_(self._pinned[name][slot], non_blocking=True)
-                self._filled[slot].record(self._stream)
+    def _view(self, take: Callable[[Tensor], Tensor], time: float | Tensor) -> TrainingView:
+        """Return a view without its codes; `take` selects one of a tensor [V, ...]."""
+        pose, intrinsics, position = take(self.cameras)[:23].split((16, 4, 3))
+        camera = CameraTensors(self.width, self.height, pose.view(4, 4), intrinsics, position)
+        names = "mask", "exposure_truth", "estimates"
+        parts = {name: None if (v := getattr(self.targets, name)) is None else take(v) for name in names}
+        return TrainingView(camera, time, replace(self.targets, **parts))
 
 
-ViewSource = ViewStack | PhotoStream | Sequence[TrainingView]
-"""Source of views by number for steps: a ViewStack if all photos are on a GPU, a PhotoStream if they are streamed to
-it, a PhotoSource on a CPU; a PhotoSource or a list on a GPU without CUDA graphs."""
+def pixel_bytes(views: Sequence[View]) -> int:
+    """Return the bytes of a pixel's codes and mask on the device: if one photo has 16 bits or a mask, all get them."""
+    codes = 6 if any(view.codes.dtype == np.uint16 for view in views) else 3
+    return codes + 4 * any(view.mask is not None for view in views)
 
 
-class TrainingViews:
-    """The training views in the form that steps take.
+class ViewDataset(Sequence[TrainingView]):
+    """Training views whose photos stay in memory or in a file; [i] uploads view i at each access.
 
-    They are uploaded at the first access of `source`.
+    Attributes:
+        scale: Values and intervals that the codes stand for.
     """
 
-    def __init__(self, views: Sequence[View], field: RadianceField, config: Config, *, use_cuda_graph: bool):
-        """Prepare the views of a field's normalized scene; steps are captured if use_cuda_graph."""
-        self._views, self._field, self._config, self._use_cuda_graph = views, field, config, use_cuda_graph
-        self._uses_intervals = False
+    def __init__(
+        self,
+        views: Sequence[View],
+        base_time: float,
+        device,
+        *,
+        truth: bool,
+        clipping: bool = True,
+        compare_by: Response | None = None,
+        estimates: list[Tensor] | None = None,
+    ):
+        """Wrap views.
 
-    @cached_property
-    def light_estimates(self) -> list[ClippedLight] | None:
-        """Estimates of each view's clipped light; None if there are none, or if colors are encoded values."""
-        field = self._field
-        response = None if field.color_model.display_referred else field.response
-        return light_estimates(self._views, response, self._config.loss, field.gaussians.means.device)
+        Args:
+            views: The training views.
+            base_time: Exposure time dt_1 of the field, seconds.
+            device: Torch device.
+            truth: Also upload HDR truth.
+            clipping: As in code_scale().
+            compare_by: The response of code_scale(): exposures are compared by it, encoded values without.
+            estimates: For each view those of its Target.
+        """
+        self.views, self.base_time, self.device = views, base_time, device
+        self.truth, self.estimates = truth, estimates
+        self._deep = any(view.codes.dtype == np.uint16 for view in views)
+        self.scale = code_scale(65535 if self._deep else 255, compare_by, device, clipping=clipping)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.views)
+
+    def __getitem__(self, index: int) -> TrainingView:
+        """Upload a view to the device."""
+        view, tensors = self.views[index], {name: t.to(self.device) for name, t in self.tensors(index).items()}
+        camera = CameraTensors.of(view.camera, self.device)
+        return TrainingView(camera, view.exposure_time, Target(scale=self.scale, **tensors))
+
+    def tensors(self, index: int) -> dict[str, Tensor]:
+        """Return the tensors of a photo's Target on the CPU, by their names there; those that the photo has."""
+        view = self.views[index]
+        codes = view.codes
+        if self._deep and codes.dtype == np.uint8:
+            codes = codes.astype(np.uint16) * np.uint16(257)  # Maps 8-bit white to 16-bit white and keeps every value.
+        tensors = {"codes": code_tensor(codes, "cpu")}
+        if view.mask is not None:
+            tensors["mask"] = torch.tensor(np.ascontiguousarray(view.mask), dtype=torch.float32)[..., None]
+        if self.truth and view.hdr is not None:
+            radiance = torch.tensor(np.ascontiguousarray(view.hdr), dtype=torch.float32)
+            tensors["exposure_truth"] = radiance * self.base_time
+        if self.estimates is not None:
+            tensors["estimates"] = self.estimates[index]
+        return tensors
 
     @property
-    def clipped_light_targets(self) -> list[Tensor] | None:
-        """Estimates [h, w, 6] of each view's log light, to which the loss pulls clipped pixels; None if it does not."""
-        estimates = self.light_estimates if compares_exposures(self._config.loss, self._field) else None
-        return None if estimates is None else [estimate.log_light for estimate in estimates]
-
-    def use_code_intervals(self) -> None:
-        """Turn bright codes into intervals, if they are not yet."""
-        if not self._uses_intervals:
-            self._uses_intervals = True
-            self._photos.scale.use_intervals()
-
-    @cached_property
-    def source(self) -> ViewSource:
-        """The views that a step selects from: on the device, or in a source that uploads them one by one."""
-        photos, where, device = self._photos, self._config.schedule.photo_cache, torch.device(self._photos.device)
-        if device.type == "cpu":  # Memory is the device's, or a file is mapped into it.
-            return photos
-        limit = MAX_MEMORY_PART * torch.cuda.mem_get_info(device)[0]
-        if where in ("memory", "disk") or (where == "auto" and photos.bytes > limit):
-            log.info("plan: photos: %s are copied to %s one by one, a step ahead", format_bytes(photos.bytes), device)
-            try:
-                return PhotoStream(photos) if self._use_cuda_graph else photos
-            except ValueError as error:
-                log.info("%s: they are copied one by one, and steps are not captured as CUDA graphs", error)
-                return photos
-        views = list(photos)
-        # Only captured steps need all photos in one tensor.
-        return (ViewStack.of(views) if self._use_cuda_graph else None) or views
-
-    @cached_property
-    def _photos(self) -> PhotoSource:
-        """The views, with the scale of their codes."""
-        loss, field = self._config.loss, self._field
-        device = field.gaussians.means.device
-        response = field.response if compares_exposures(loss, field) else None
-        return PhotoSource(
-            self._views,
-            field.base_time,
-            device,
-            clipping=loss.clipping,
-            compare_by=response,
-            estimates=self.clipped_light_targets,
-            truth=loss.uses_hdr,
-        )
+    def bytes(self) -> int:
+        """Memory that all views would take on the device."""
+        each, truth_bytes = pixel_bytes(self.views), 12 * self.truth
+        pixels = (v.camera.width * v.camera.height * (each + truth_bytes * (v.hdr is not None)) for v in self.views)
+        return sum(pixels)

@@ -23,7 +23,7 @@ from sehdr_warp.training.cost import (
     training_cost,
 )
 from sehdr_warp.training.plan import make_plan
-from sehdr_warp.training.targets import PhotoSource
+from sehdr_warp.training.training_views import ViewDataset
 
 from .toy import toy_scene
 
@@ -115,7 +115,7 @@ def test_masks_and_wide_codes_count_as_photos():
         scene = replace(toy_scene(), views=views)
         device = torch.device("cpu")
         plan = make_plan(scene, load_config("fast", {"response.name": "srgb"}), device)
-        source = PhotoSource(scene.train_views, 1.0, "cpu", truth=False)
+        source = ViewDataset(scene.train_views, 1.0, "cpu", truth=False)
         assert all(choice.cost.photo_bytes == source.bytes for choice in estimate(plan, plan.config, device)[0])
         return source.bytes / pixels
 

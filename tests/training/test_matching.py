@@ -17,8 +17,8 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
 from sehdr_warp.training.matching import seed_gaussians
-from sehdr_warp.training.targets import PhotoSource
 from sehdr_warp.training.train import create_trainer, train
+from sehdr_warp.training.training_views import ViewDataset
 
 from .wall_and_lamp import LAMP, WALL, wall_and_lamp
 
@@ -115,7 +115,7 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     wall = replace(scene, views=tuple(dark))
     field = make_field(wall, config, LINEAR, device)
     normalized = field.normalization.scene(scene)
-    views = PhotoSource(normalized.train_views, field.base_time, device, truth=False)
+    views = ViewDataset(normalized.train_views, field.base_time, device, truth=False)
     matcher = make_matcher(normalized, LINEAR, device)
     with torch.no_grad():
         # Opaque, so that the wall is explained from the start.

@@ -151,7 +151,7 @@ def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
     widths = []
     for _ in range(20):
         trainer.step()
-        table = trainer.views.source[0].target.scale.table[1:-1]
+        table = trainer.data_manager.views[0].target.scale.table[1:-1]
         widths.append(float((table[:, 2] - table[:, 1]).max()))
     assert max(widths[:17]) == 0 < min(widths[17:])
 
