@@ -282,7 +282,7 @@ class Config(_Table):
 
     @property
     def load_options(self) -> dict[str, Any]:
-        """Arguments of load_scene() that a config states."""
+        """Arguments of load_scene() that a config states, beside LoadArguments."""
         response, cache = self.response, self.schedule.photo_cache
         options = {"response": response.name, "method": response.method, "candidates": response.candidates}
         return options | {"photo_storage": "memory" if cache == "device" else cache}

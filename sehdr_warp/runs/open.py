@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError, SehdrError, missing
 from ..subsets import first_names
 from .device import pick_device
-from .values import LOAD_OPTIONS, LoadArguments
+from .values import SCENE_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     from ..response import Response
@@ -70,7 +70,7 @@ def load_scene_and_log_notes(data: LoadArguments, **options: Any) -> Scene:
 
     path = data.get("path")
     assert path is not None, "the caller checks the path"
-    saved: dict[str, Any] = {name: data.get(name) for name in (*LOAD_OPTIONS, "views")}
+    saved: dict[str, Any] = {name: data.get(name) for name in (*SCENE_OPTIONS, "views")}
     scene = load_scene(path, **saved | options)
     for note in scene.notes:
         log.info("%s", note)
@@ -92,8 +92,15 @@ class PhotoRequest:
         return PhotoRequest(self.data, self.options | options, cameras)
 
     def load(self) -> Scene:
-        """Load the scene, held out as in the run that is resumed."""
-        return with_saved_splits(load_scene_and_log_notes(self.data, **self.options), self.cameras)
+        """Load the scene, held out as in the run that is resumed; log that if other views would be today."""
+        scene = load_scene_and_log_notes(self.data, **self.options)
+        splits = {entry.name: entry.split for entry in self.cameras}
+        views = tuple(replace(view, split=splits.get(view.name, view.split)) for view in scene.views)
+        result = replace(scene, views=views)
+        if [view.name for view in result.test_views] != [view.name for view in scene.test_views]:
+            names = first_names([view.name for view in result.test_views])
+            log.info("held out, as when the training began: %s", names or "no photo")
+        return result
 
 
 def load_run_scene(run: Run, data: str | None) -> Scene:
@@ -111,9 +118,9 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
         raise SehdrError(f"{run.path}: does not say where its photos are; give --data")
     if data is None and not is_embedded(place) and not Path(place).exists():
         raise InputError(place, "the photos of the run are no longer here", "say where they are with --data")
-    photos = PhotoRequest(run.data | {"path": place}, {}).of_run(run.config, run.response, run.cameras)
+    request = PhotoRequest(run.data | {"path": place}, {}).of_run(run.config, run.response, run.cameras)
     saved = {entry.name: entry.camera for entry in run.cameras}
-    scene = in_world_of_run(photos.load(), saved, run.field.normalization.unit, run.path, place)
+    scene = in_world_of_run(request.load(), saved, run.field.normalization.unit, run.path, place)
     times = {entry.name: entry.exposure_time for entry in run.cameras}
     views = (replace(view, exposure_time=times.get(view.name, view.exposure_time)) for view in scene.views)
     scene = replace(scene, views=tuple(views))
@@ -185,17 +192,6 @@ def in_world_of_run(
 
     points = scale * scene.points @ turn.T + shift
     return replace(scene, views=tuple(map(with_pose, scene.views)), points=points)
-
-
-def with_saved_splits(scene: Scene, cameras: Iterable[CameraEntry]) -> Scene:
-    """Return a scene whose views are held out as in a run's scene.json; log that if they would be others today."""
-    splits = {entry.name: entry.split for entry in cameras}
-    views = tuple(replace(view, split=splits.get(view.name, view.split)) for view in scene.views)
-    saved = replace(scene, views=views)
-    if [view.name for view in saved.test_views] != [view.name for view in scene.test_views]:
-        names = first_names([view.name for view in saved.test_views])
-        log.info("held out, as when the training began: %s", names or "no photo")
-    return saved
 
 
 def load_run_scene_with_confidence(run: Run, data: str | None) -> Scene:

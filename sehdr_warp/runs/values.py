@@ -64,8 +64,8 @@ class LoadArguments(TypedDict, total=False):
     views: list[str]
 
 
-LOAD_OPTIONS = ("exposure_index", "max_size", "holdout")
-"""Names of LoadArguments that are options of the command line."""
+SCENE_OPTIONS = ("exposure_index", "max_size", "holdout")
+"""Names of LoadArguments that are options of the command line; Config.load_options states the other arguments."""
 
 
 class DataValues(Values):

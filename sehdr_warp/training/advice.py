@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ..runs.config_files import config_fields, flag_text
 from ..runs.run import Run
 from ..runs.scene_description import FOUND
-from ..runs.values import LOAD_OPTIONS, LoadArguments
+from ..runs.values import SCENE_OPTIONS, LoadArguments
 from ..scene.pose_conventions import MISFIT
 from ..subsets import first_names
 from .plan import STEPS_PER_PHOTO
@@ -64,7 +64,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
         run.summary() | {"metrics": run.metrics()},
         len(scene.train_views),
         place,
-        option_words({name: data.get(name) for name in LOAD_OPTIONS} | options),
+        option_words({name: data.get(name) for name in SCENE_OPTIONS} | options),
         resumed_at=trainer.first_iteration,
         unplaced=scene.unplaced,
         steps=trainer.total if "schedule.iterations" in trainer.config.plan.keep else None,

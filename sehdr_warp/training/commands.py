@@ -18,10 +18,13 @@ from ..files import require_text
 from ..runs import config_files as configs
 from ..runs.device import pick_device
 from ..runs.open import PhotoRequest, load_scene_and_log_notes
-from ..runs.values import LOAD_OPTIONS, LoadArguments
+from ..runs.values import SCENE_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
+    from ..runs.config import Config
     from ..runs.run import Run
+    from .launch import RankInfo
+    from .ranks import Ranks
 
 log = logging.getLogger(__name__)
 
@@ -108,14 +111,14 @@ class Train:
 def run_train(args: Train, argv: Sequence[str]) -> None:
     """Train, or print the plan, and print what was written and what to do next.
 
-    `argv` are the words of the command line. With --gpus, a process for each GPU runs them again, and enters this
-    function with a rank, as under torchrun.
+    With --plan-only, _print_plan() is all. With --blocks, _train_blocks() starts processes of its own. With --gpus,
+    launch() starts a process for each GPU: it runs `argv`, the words of the command line, again and enters this
+    function as a rank, as under torchrun. A rank goes to _train_on_rank(), a single process to _train().
     """
     _check_options(args)
     from .launch import device_of_rank, launch, rank_from_environment
 
-    gpus, device, rank_info = args.machine.gpus, args.machine.device, rank_from_environment()
-    uses_blocks = _uses_blocks(args)
+    gpus, rank_info, uses_blocks = args.machine.gpus, rank_from_environment(), _check_blocks(args)
     if args.training.plan_only:
         if rank_info is None or rank_info.rank == 0:
             _print_plan(args)
@@ -123,33 +126,57 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     if uses_blocks:
         if rank_info is not None:
             raise UsageError("--blocks starts its own processes; leave torchrun out")
-        run = _train_blocks(args)
-        if run is not None:
+        if (run := _train_blocks(args)) is not None:
             _print_result(args, run)
             return
         argv = _without_blocks(argv)  # One training is enough, as --blocks auto found.
     if rank_info is not None:
-        if gpus not in (1, rank_info.local_count):
-            raise UsageError(f"--gpus {gpus}, but {rank_info.local_count} ranks were started; leave it out")
-        from .following import train_as_worker
-        from .ranks import join_ranks
-
-        with join_ranks(rank_info, device_of_rank(rank_info.local_rank, device)) as ranks:
-            if ranks.is_main_process:
-                _train(args, ranks)
-            else:
-                train_as_worker(ranks, _path_of(args))
+        _train_on_rank(args, rank_info)
     elif gpus > 1:
-        device_of_rank(gpus - 1, device)  # Raises an error if there are fewer.
+        device_of_rank(gpus - 1, args.machine.device)  # Raises an error if there are fewer.
         launch(gpus, _run_in_rank, list(argv))
     else:
         _train(args)
 
 
-def _without_blocks(argv: Sequence[str]) -> list[str]:
-    """Return a command line without `--blocks auto` or `--blocks=auto`."""
-    pairs = zip(argv, ["", *argv], strict=False)
-    return [word for word, before in pairs if before != "--blocks" and word.partition("=")[0] != "--blocks"]
+def _check_options(args: Train) -> None:
+    """Raise an error for a missing SCENE or options that contradict each other, before torch is imported."""
+    from ..scene import is_embedded
+
+    data, options, output = args.data, args.training, args.output
+    if data is None and not output.resume:
+        raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
+    if data is not None and not is_embedded(data) and not os.path.lexists(data):
+        raise missing(Path(data), "not found", "give a folder of photos, or 'embedded'")
+    if args.machine.gpus < 1:
+        raise UsageError(f"--gpus {args.machine.gpus} is not 1 or more")
+    if data is not None and all(Path(data, name).is_file() for name in ("config.json", "run.json")):
+        steps = "" if options.iterations is None else f" --iterations {options.iterations}"
+        command = f"sehdr-warp train --resume --out {shlex.quote(data)}{steps}"
+        raise UsageError(f"{data}: is a run, not photos; {command} continues it")
+    if output.resume and output.overwrite:
+        raise UsageError("--resume continues the run in --out, --overwrite replaces it; leave one out")
+    if options.plan_only and output.resume:
+        raise UsageError("--plan-only plans a new training; leave --resume out")
+    if output.out is None and not options.plan_only:
+        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
+    if options.blocks is not None and (output.view or output.tensorboard):
+        raise UsageError("--view and --tensorboard are without effect with --blocks; view the run when it is done")
+
+
+def _train_on_rank(args: Train, rank_info: "RankInfo") -> None:
+    """Train together with other ranks: rank 0 by _train(), the others by the training that it sends them."""
+    from .launch import device_of_rank
+    from .ranks import join_ranks
+    from .workers import train_as_worker
+
+    if args.machine.gpus not in (1, rank_info.local_count):
+        raise UsageError(f"--gpus {args.machine.gpus}, but {rank_info.local_count} ranks were started; leave it out")
+    with join_ranks(rank_info, device_of_rank(rank_info.local_rank, args.machine.device)) as ranks:
+        if ranks.is_main_process:
+            _train(args, ranks)
+        else:
+            train_as_worker(ranks, _photo_path(args))
 
 
 def _run_in_rank(argv: list[str]) -> None:
@@ -161,12 +188,16 @@ def _run_in_rank(argv: list[str]) -> None:
     main(argv)
 
 
-def _train(args: Train, ranks=None) -> None:
-    """Train or resume a run, on this rank."""
+def _train(args: Train, ranks: "Ranks | None" = None) -> None:
+    """Train or resume a run in this process, with `ranks` as rank 0 of them."""
+    from ..console import run_with_progress
     from ..response import Response
     from ..runs.run_writer import RunWriter
+    from ..viewer.live import serve_training
+    from .advice import advice_on, options_of_run
     from .machine import precompiling
     from .scene_facts import check_dataset_truth
+    from .train import create_trainer
 
     output, out = args.output, args.output.out
     assert out is not None, "run_train() refuses it"
@@ -175,26 +206,22 @@ def _train(args: Train, ranks=None) -> None:
     resumes = folder.prepare(resume=output.resume, overwrite=output.overwrite)
     if output.resume and not resumes:
         log.info("%s holds no run yet: a training begins there", out)
-    saved = folder.read_config() if resumes else None
-    data, config = _load_arguments(args, folder.read_info()["data"] if resumes else None), _config(args, saved)
-    photos = PhotoRequest(data, config.load_options)
-    if saved is not None:
+    saved_config = folder.read_config() if resumes else None
+    data = _load_arguments(args, folder.read_info()["data"] if resumes else None)
+    config = _config(args, saved_config)
+    request = PhotoRequest(data, config.load_options)
+    if saved_config is not None:
         # create_trainer() refuses another --response than that of the run.
-        photos = photos.of_run(saved, Response.from_dict(folder.read_info()["response"]), folder.read_cameras())
-        photos = photos if args.scene.holdout is None else replace(photos, cameras=())
+        response = Response.from_dict(folder.read_info()["response"])
+        request = request.of_run(saved_config, response, folder.read_cameras())
+        request = request if args.scene.holdout is None else replace(request, cameras=())
     check_dataset_truth(data, config)
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
-            ranks.request_photos(photos)
-        scene = photos.load()
-        from ..console import run_with_progress
-        from ..viewer.live import serve_training
-        from .advice import advice_on, options_of_run
-        from .train import create_trainer
-
+            ranks.request_photos(request)
         trainer = create_trainer(
-            scene,
+            request.load(),
             out,
             config,
             device=device,
@@ -234,8 +261,8 @@ def _print_result(args: Train, run: "Run", advice: Sequence[str] = ()) -> None:
     print(json.dumps(summary) if args.output.json else "\n".join([_ending(run.path, summary), *advice]))
 
 
-def _uses_blocks(args: Train) -> bool:
-    """Return whether a command line trains in blocks; --resume continues such a training without --blocks too."""
+def _check_blocks(args: Train) -> bool:
+    """Return whether a command line trains in blocks, as --resume of such a run does too; refuse what cannot be."""
     from ..blocks.block_plan import MOST_BLOCKS
     from ..blocks.train import is_in_blocks
 
@@ -282,32 +309,13 @@ def _train_blocks(args: Train) -> "Run | None":
     )
 
 
-def _check_options(args: Train) -> None:
-    """Raise an error for a missing SCENE or options that contradict each other, before torch is imported."""
-    from ..scene import is_embedded
-
-    data, options, output = args.data, args.training, args.output
-    if data is None and not output.resume:
-        raise UsageError("train needs SCENE, a folder of photos or `embedded`; see sehdr-warp train --help")
-    if data is not None and not is_embedded(data) and not os.path.lexists(data):
-        raise missing(Path(data), "not found", "give a folder of photos, or 'embedded'")
-    if args.machine.gpus < 1:
-        raise UsageError(f"--gpus {args.machine.gpus} is not 1 or more")
-    if data is not None and all(Path(data, name).is_file() for name in ("config.json", "run.json")):
-        steps = "" if options.iterations is None else f" --iterations {options.iterations}"
-        command = f"sehdr-warp train --resume --out {shlex.quote(data)}{steps}"
-        raise UsageError(f"{data}: is a run, not photos; {command} continues it")
-    if output.resume and output.overwrite:
-        raise UsageError("--resume continues the run in --out, --overwrite replaces it; leave one out")
-    if options.plan_only and output.resume:
-        raise UsageError("--plan-only plans a new training; leave --resume out")
-    if output.out is None and not options.plan_only:
-        raise UsageError("train needs --out, a folder for the run; or --plan-only, to train nothing")
-    if options.blocks is not None and (output.view or output.tensorboard):
-        raise UsageError("--view and --tensorboard are without effect with --blocks; view the run when it is done")
+def _without_blocks(argv: Sequence[str]) -> list[str]:
+    """Return a command line without `--blocks auto` or `--blocks=auto`."""
+    pairs = zip(argv, ["", *argv], strict=False)
+    return [word for word, before in pairs if before != "--blocks" and word.partition("=")[0] != "--blocks"]
 
 
-def _path_of(args: Train) -> str | None:
+def _photo_path(args: Train) -> str | None:
     """Return where the command line says that the photos are, as an absolute path or a name; None if it does not."""
     from ..scene import is_embedded
 
@@ -320,7 +328,7 @@ def _path_of(args: Train) -> str | None:
 
 def _load_arguments(args: Train, saved: LoadArguments | None) -> LoadArguments:
     """Return where the photos are and how they are loaded: by the command line, or else as in the run to resume."""
-    options: dict = {"path": _path_of(args)} | {name: getattr(args.scene, name) for name in LOAD_OPTIONS}
+    options: dict = {"path": _photo_path(args)} | {name: getattr(args.scene, name) for name in SCENE_OPTIONS}
     if saved is not None:
         options = {name: saved.get(name) if value is None else value for name, value in options.items()}
         options |= {"views": views} if (views := saved.get("views")) else {}
@@ -329,7 +337,7 @@ def _load_arguments(args: Train, saved: LoadArguments | None) -> LoadArguments:
     return LoadArguments(**options)
 
 
-def _config(args: Train, saved):
+def _config(args: Train, saved: "Config | None") -> "Config":
     """Return the config of the preset, or that of the run that is resumed, with the fields of the command line."""
     options = args.training
     shortcuts = {"response.name": args.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}

@@ -45,6 +45,7 @@ class RunOutput:
         self.folder, self._is_block, self._tensorboard = folder, is_block, tensorboard
         self._writer: Any = None  # Created at the first log
         self._run: Run | None = None
+        self._evidence: Evidence | None = None  # Of the photos for the last step's Gaussians
         self._evaluate_at = {config.scaled(n) for n in config.schedule.evaluate_at}
         is_default = config.schedule.checkpoint_every == ScheduleConfig().checkpoint_every
         is_set = not is_default or "schedule.checkpoint_every" in config.plan.keep
@@ -106,29 +107,21 @@ class RunOutput:
         self.folder.write_checkpoint(state.tensors, state.values, keep=keep)
         self._saved_at = time.monotonic()
 
-    def save_end(self, trainer: Trainer) -> Evidence | None:
-        """Write the last checkpoint.
-
-        After the last step, Gaussians that no photo shows are removed before, and the rest is evaluated.
-
-        Returns:
-            The evidence of the photos for the Gaussians, None if no last step was made.
-        """
-        evidence = None
+    def save_end(self, trainer: Trainer) -> None:
+        """Write the last checkpoint; after the last step, first remove Gaussians that no photo shows, and evaluate."""
         if trainer.iteration >= trainer.total and trainer.iteration > trainer.first_iteration:
-            evidence = remove_unseen(trainer)
+            self._evidence = remove_unseen(trainer)
             self.evaluate(trainer)
         self.checkpoint(trainer, last=True)
-        return evidence
 
-    def write_results(self, trainer: Trainer, evidence: Evidence | None) -> None:
-        """Write the summary; after the last step, also the confidence and residual regions. `evidence`: of save_end."""
+    def write_results(self, trainer: Trainer) -> None:
+        """Write the summary after save_end(); after the last step, also the confidence and residual regions."""
         self._write_summary(trainer)
         if self._writer is not None:
             self._writer.close()
         if trainer.iteration < trainer.total:
             return
-        checkpoint_hash = self.folder.checkpoint_hash
+        evidence, checkpoint_hash = self._evidence, self.folder.checkpoint_hash
         if self._is_block and evidence is not None and checkpoint_hash is not None:
             write_confidence(self.folder, evidence, checkpoint_hash)
             return

@@ -24,7 +24,6 @@ from ..runs.values import LoadArguments
 from ..scene import Scene
 from ..scene.normalization import Normalization, normalization_of
 from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
-from .following import send_training, several_ranks_notes
 from .initialization import brighten_clipped, make_field, make_matcher, response_for_training, sizes_of
 from .machine import summary_writer
 from .plan import check_fields, make_plan
@@ -33,6 +32,7 @@ from .run_output import RunOutput
 from .scene_facts import check_scene_truth
 from .trainer import Trainer
 from .training_state import load_state, state_of
+from .workers import send_training, several_ranks_notes
 
 log = logging.getLogger(__name__)
 

@@ -210,11 +210,12 @@ class Trainer:
         self.synchronize()
         self.gather()
         self.check()
-        evidence = None if self.output is None else self.output.save_end(self)
+        if self.output is not None:
+            self.output.save_end(self)
         if self.ranks is not None:
             self.ranks.shutdown()
         if self.output is not None:
-            self.output.write_results(self, evidence)
+            self.output.write_results(self)
         self._finished = self.iteration >= self.total
 
     # One step

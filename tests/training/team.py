@@ -28,9 +28,9 @@ def _rank(rank: int, work, folder: Path, arguments: tuple) -> None:
 
 def train_together(ranks, folder: Path, strategies: list[str], iterations: int) -> None:
     """Trains the toy scene with each strategy; each rank saves its state as <strategy>.<rank>."""
-    from sehdr_warp.training.following import train_as_worker
     from sehdr_warp.training.train import create_trainer
     from sehdr_warp.training.training_state import state_of
+    from sehdr_warp.training.workers import train_as_worker
 
     from .toy import VARIANTS, toy_scene
 

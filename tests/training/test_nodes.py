@@ -18,10 +18,10 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import CameraEntry, RunFolder
 from sehdr_warp.runs.scene_description import describe_scene
-from sehdr_warp.training import following
-from sehdr_warp.training.following import PhotoRequest, _check_same_photos
+from sehdr_warp.training import workers
 from sehdr_warp.training.launch import RankInfo, open_store, rank_from_environment
 from sehdr_warp.training.ranks import rank_timeout
+from sehdr_warp.training.workers import PhotoRequest, _check_same_photos
 
 from ..refusals import call
 from .toy import toy_scene
@@ -153,13 +153,13 @@ def test_other_nodes_hold_out_what_a_resumed_run_does(monkeypatch):
         raise InterruptedError
 
     monkeypatch.setattr("sehdr_warp.runs.open.load_scene_and_log_notes", lambda data, **options: scene)
-    monkeypatch.setattr(following, "_check_same_photos", check)
-    monkeypatch.setattr(following, "field_from_checkpoint", lambda *_: None)
+    monkeypatch.setattr(workers, "_check_same_photos", check)
+    monkeypatch.setattr(workers, "field_from_checkpoint", lambda *_: None)
     shared = SimpleNamespace(config=None, layout={}, values={}, info={})
     ranks = SimpleNamespace(info=RankInfo(1, 2, 0, 1, 1, 2), requested_photos=lambda: request)
     ranks.broadcast_object, ranks.broadcast_arrays = lambda: shared, lambda arrays: None
     with pytest.raises(InterruptedError):
-        following.train_as_worker(ranks)
+        workers.train_as_worker(ranks)
     assert len(scene.train_views) == 5 and len(loaded[0].views) == 6
 
 
@@ -173,7 +173,7 @@ def test_nodes_train_bare_photos_in_the_world_of_rank_0():
         views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
     found = replace(scene, views=tuple(views), points=2 * scene.points + [1, 2, 3])
     message = SimpleNamespace(scene=describe_scene(scene), info={"normalization": {"center": [0, 0, 0], "unit": 4.0}})
-    aligned = following._in_world_of_rank_0(found, message)
+    aligned = workers._in_world_of_rank_0(found, message)
     _check_same_photos(SimpleNamespace(info=RankInfo(1, 2, 0, 1, 1, 2)), message, aligned)
     np.testing.assert_allclose(aligned.points, scene.points, atol=1e-12)
 

@@ -1,4 +1,4 @@
-"""Train on several ranks: rank 0 sends its training to the others, which take the same steps."""
+"""Ranks other than 0: rank 0 sends them its training, and they take the same steps without writing anything."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
