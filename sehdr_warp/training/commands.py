@@ -206,14 +206,12 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
     resumes = folder.prepare(resume=output.resume, overwrite=output.overwrite)
     if output.resume and not resumes:
         log.info("%s holds no run yet: a training begins there", out)
-    saved_config = folder.read_config() if resumes else None
-    data = _load_arguments(args, folder.read_info()["data"] if resumes else None)
-    config = _config(args, saved_config)
+    info, saved_config = folder.read_info() if resumes else {}, folder.read_config() if resumes else None
+    data, config = _load_arguments(args, info.get("data")), _config(args, saved_config)
     request = PhotoRequest(data, config.load_options)
     if saved_config is not None:
         # create_trainer() refuses another --response than that of the run.
-        response = Response.from_dict(folder.read_info()["response"])
-        request = request.of_run(saved_config, response, folder.read_cameras())
+        request = request.of_run(saved_config, Response.from_dict(info["response"]), folder.read_cameras())
         request = request if args.scene.holdout is None else replace(request, cameras=())
     check_dataset_truth(data, config)
     device = pick_device(args.machine.device) if ranks is None else ranks.device

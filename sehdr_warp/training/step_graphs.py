@@ -94,7 +94,6 @@ class StepGraphs:
         self._index.fill_(index)
         if isinstance(views, PhotoStream):
             views.bring(index)
-
         try:
             if second is None:
                 result = first.run(key, lambda: step.run(views.at(self._index), options, capacity))

@@ -138,9 +138,10 @@ def _new_trainer(
 ) -> Trainer:
     """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder."""
     normalization = normalization_of(scene)
-    plan = make_plan(normalization.scene(scene), config, device) if config.plan.enabled else None
+    normalized = normalization.scene(scene)
+    plan = make_plan(normalized, config, device) if config.plan.enabled else None
     if plan is None:
-        check_fields(normalization.scene(scene), config)
+        check_fields(normalized, config)  # As make_plan() does.
     else:
         config = plan.config
     check_scene_truth(scene, config.loss)  # Here, before the photos are matched; GradientStep repeats it.
@@ -148,16 +149,18 @@ def _new_trainer(
     started = time.perf_counter()
     compensation, matcher = None if shared is None else shared.compensation_of(scene.views), None
     if shared is None and plan is not None and estimates_compensation(scene, config, response):
-        estimate = estimate_compensation(normalization.scene(scene), config, response, device)
+        estimate = estimate_compensation(normalized, config, response, device)
         compensation, matcher = estimate.compensation, estimate.matcher
         plan = replace(plan, decisions=(*plan.decisions, estimate.decision))
     photos = scene if compensation is None else compensation.normalize_photos(scene, response)
-    get_matcher = cache(lambda: matcher or make_matcher(normalization.scene(photos), response, device))
+    normalized = normalization.scene(photos)
+    # One matcher for compensation, initial points and seeded Gaussians; made when it is needed, because it takes long.
+    get_matcher = cache(lambda: matcher or make_matcher(normalized, response, device))
     field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
     trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks)
     light = trainer.data_manager.clipped_light_targets  # Estimated once, for this and for the loss.
     if light is not None and not config.model.init_file:
-        brighten_clipped(field, normalization.scene(photos).train_views, light)
+        brighten_clipped(field, normalized.train_views, light)
     trainer.seconds = time.perf_counter() - started
     # The folder is begun last, when the scene is known to be usable.
     plan_values, state = None if plan is None else plan.to_dict(), state_of(trainer)

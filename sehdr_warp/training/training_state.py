@@ -27,9 +27,9 @@ def state_of(trainer: Trainer) -> Checkpoint:
     order, remaining = trainer.sampler.state()
     parts["generators"] = {"order": order, "device": trainer.generator.get_state()}
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-    counts = {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
-    values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining} | counts
-    values["large_scene"] = trainer.large_scene
+    values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining}
+    values |= {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
+    values |= {"large_scene": trainer.large_scene}
     return Checkpoint(tensors, values)
 
 

@@ -153,6 +153,5 @@ class ViewDataset(Sequence[TrainingView]):
     @property
     def bytes(self) -> int:
         """Memory that all views would take on the device."""
-        each, truth_bytes = pixel_bytes(self.views), 12 * self.truth
-        pixels = (v.camera.width * v.camera.height * (each + truth_bytes * (v.hdr is not None)) for v in self.views)
-        return sum(pixels)
+        each, truth = pixel_bytes(self.views), 12 * self.truth
+        return sum(v.camera.width * v.camera.height * (each + truth * (v.hdr is not None)) for v in self.views)

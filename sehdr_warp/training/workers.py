@@ -77,8 +77,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
         ranks.share_photos(scene, _bytes_of(scene))
     else:
         scene = ranks.receive_photos()
-    large_scene = message.values["large_scene"]
-    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks, large_scene=large_scene)
+    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks, large_scene=message.values["large_scene"])
     load_state(trainer, checkpoint)
     del message, checkpoint, tensors
     for _ in trainer:
