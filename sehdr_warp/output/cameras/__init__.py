@@ -1,1 +1,1 @@
-"""Cameras to render: paths for films, framing of the subject, and camera files for other programs."""
+"""Cameras to render: camera paths, framing of the subject, and camera files for other programs."""

@@ -1,4 +1,4 @@
-"""Camera paths that show the subject: framed whole, in a film's format, and not from behind a wall."""
+"""Camera paths that show the subject: framed whole, in 16:9, and not from behind a wall."""
 
 import logging
 import math
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from ...runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
-FILM_SIZES = ((640, 360), (1280, 720), (1920, 1080))
-"""Sizes of a path that states none, 16:9: the first that is as high as the photos' short side."""
+WIDESCREEN_SIZES = ((640, 360), (1280, 720), (1920, 1080))
+"""Sizes of views that state none, 16:9: the first that is as high as the photos' short side."""
 _WIDEST = math.radians(75)  # Vertical field of view to which a path opens for its subject
 MOST_ZOOM = 2.0  # Times that it then shows more than the photos do: photos show most of a subject, fog looks larger
 _MARGIN = 1.25  # Of the picture around the subject, whose surface is thick
@@ -30,15 +30,15 @@ _REACH = 0.7  # Surfaces within this part of the cameras' distance from the focu
 _EXTENT = 90  # Percentile of their distances from the focus that the picture holds
 
 
-def film_size(photos: Sequence[Camera]) -> tuple[int, int]:
-    """Return width and height for a path among photos: 16:9, at least as high as their short side, at most 1080."""
+def widescreen_size(photos: Sequence[Camera]) -> tuple[int, int]:
+    """Return width and height for views among photos: 16:9, at least as high as their short side, at most 1080."""
     short = float(np.median([min(camera.width, camera.height) for camera in photos]))
-    return next((size for size in FILM_SIZES if size[1] >= short), FILM_SIZES[-1])
+    return next((size for size in WIDESCREEN_SIZES if size[1] >= short), WIDESCREEN_SIZES[-1])
 
 
-def film_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:
-    """Return a camera of a path in film_size, with square pixels, that shows no more at the sides than photos do."""
-    width, height = film_size(photos)
+def widescreen_camera(camera: Camera, photos: Sequence[Camera]) -> Camera:
+    """Return a camera of widescreen_size and square pixels that shows no more at the sides than photos do."""
+    width, height = widescreen_size(photos)
     if not camera.is_pinhole:
         focal = height / 2 / math.tan(_WIDEST / 2)
         return Camera(width, height, focal, focal, width / 2, height / 2, camera.world_to_camera)
@@ -56,9 +56,9 @@ def default_path(run: "RenderableScene", count: int, up: str | Sequence[float] |
     photos = training_cameras(run)
     if way := walk(photos):
         log.info("the photos walk ahead, so the path goes along %d of %d of them", len(way), len(photos))
-        return [film_camera(camera, photos) for camera in walk_path(way, count)]
+        return [widescreen_camera(camera, photos) for camera in walk_path(way, count)]
     path = orbit(photos, count, _focus_distance(run, photos), scene_up(run, up))
-    return frame_subject(run, [film_camera(camera, photos) for camera in path], photos)
+    return frame_subject(run, [widescreen_camera(camera, photos) for camera in path], photos)
 
 
 def frame_subject(run: "RenderableScene", path: Sequence[Camera], photos: Sequence[Camera]) -> list[Camera]:

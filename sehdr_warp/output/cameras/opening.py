@@ -12,15 +12,15 @@ from ...scene.gravity import up_direction
 from ...subsets import evenly
 from ..world_transform import scene_up, world_transform
 from .framing import (
-    FILM_SIZES,
     MOST_ZOOM,
     NEAR,
     SMALL,
-    film_camera,
+    WIDESCREEN_SIZES,
     nearest_depth,
     subject_radius,
     subject_tangent,
     visible_surface,
+    widescreen_camera,
 )
 from .paths import look_at_pose, moved, walk
 from .scene_cameras import camera_axes, camera_positions, common_focus, middle_index, surround, training_cameras
@@ -55,7 +55,7 @@ def opening_view(run: "RenderableScene") -> Camera | None:
     if not photos:
         return None
     if way := walk(photos):
-        return film_camera(way[0], photos)
+        return widescreen_camera(way[0], photos)
     up, focus = scene_up(run), common_focus(photos)
     radius = None if focus is None else subject_radius(run, photos, focus)
     positions = camera_positions(photos)
@@ -126,7 +126,7 @@ def _view_from_outside(run: "RenderableScene") -> Camera:
     focus = _focus_without_cameras(run)
     radius = max(float(np.median(np.linalg.norm(_means(run) - focus, axis=1))), 1e-6)
     _, up, forward = world_transform(run).rotation
-    width, height = FILM_SIZES[1]
+    width, height = WIDESCREEN_SIZES[1]
     focal = height / 2 / math.tan(_OUTSIDE_FOV / 2)
     for part in _OUTSIDE:
         position = focus + radius * (-part * forward + _ABOVE * part * up)
@@ -141,7 +141,7 @@ def _opening_of(
     photo: Camera, photos: Sequence[Camera], up: np.ndarray, focus: np.ndarray | None, radius: float | None
 ) -> Camera:
     """Return the opening view from a photo's place; see opening_view."""
-    camera = film_camera(photo, photos)
+    camera = widescreen_camera(photo, photos)
     around = focus is not None and surround(photos, focus, up)
     own = photo.world_to_camera[2, :3]
     ahead = own if focus is None else focus - photo.position

@@ -1,4 +1,4 @@
-"""Camera paths for films: around what the photos look at, along a walk, or a smooth way through the photos' places."""
+"""Camera paths: around what the photos look at, along a walk, or a smooth way through the photos' places."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -15,7 +15,7 @@ from ...scene.readers.camera_files import read_camera_file
 from ...splats import cameras_beside
 from ..images.ldr_files import safe_names
 from ..world_transform import WorldTransform, from_photos, world_transform
-from .framing import default_path, film_camera
+from .framing import default_path, widescreen_camera
 from .paths import interpolate
 from .scene_cameras import training_cameras
 
@@ -65,7 +65,7 @@ def select_cameras(
         photos = training_cameras(run)
         path = default_path(run, count, up) if text == "orbit" else interpolate(photos, count)
         if text == "interpolate":
-            path = [film_camera(each, photos) for each in path]
+            path = [widescreen_camera(each, photos) for each in path]
         digits = max(3, len(str(count - 1)))
         views = [(f"{text}_{index:0{digits}d}", each) for index, each in enumerate(path)]
     else:
@@ -76,30 +76,30 @@ def select_cameras(
 
 
 def _from_file(
-    run: "RenderableScene", path: Path, camera: str | None, transform: WorldTransform | None
+    run: "RenderableScene", path: Path, only: str | None, transform: WorldTransform | None
 ) -> list[tuple[str, Camera]]:
-    """Return the cameras of a file, or the one with a name, in the scene's coordinates."""
+    """Return the cameras of a file, or `only` the one of this name, in the scene's coordinates."""
     file = read_camera_file(path)
-    views, steps = file.cameras, [from_photos(run)]  # Most files are in the photos' coordinates.
+    views, to_scene = file.cameras, [from_photos(run)]  # Most files are in the photos' coordinates.
     if file.world_matrix is not None:
         try:
-            steps.insert(0, WorldTransform.from_matrix(file.world_matrix).inverse())
+            to_scene.insert(0, WorldTransform.from_matrix(file.world_matrix).inverse())
         except ValueError as error:
             raise InputError(path, f"its sehdr:worldMatrix {error}", "leave that entry out of the file") from None
     elif path.suffix.lower() in EXCHANGE_SUFFIXES:
-        steps = [(transform or world_transform(run)).inverse()]
+        to_scene = [(transform or world_transform(run)).inverse()]
     elif run.world_matrix is not None and (own := cameras_beside(Path(run.path))) is not None and own.samefile(path):
-        steps = []  # They are in the coordinates of the Gaussians beside.
-    for step in steps:
-        views = [(name, step.camera(each)) for name, each in views]
-    if camera is None:
+        to_scene = []  # They are in the coordinates of the Gaussians beside.
+    for move in to_scene:
+        views = [(name, move.camera(each)) for name, each in views]
+    if only is None:
         return views
     # Frames of a moving camera are named as by read_exchange_cameras(): numbers of four characters or more.
-    frames = re.compile(re.escape(camera) + r"_[-\d.]{4,}")
-    chosen = [view for view in views if view[0] == camera] or [view for view in views if frames.fullmatch(view[0])]
-    if not chosen:
-        raise SehdrError(f"{path}: has no camera {camera!r}{did_you_mean(camera, [name for name, _ in views])}")
-    return chosen
+    frames, names = re.compile(re.escape(only) + r"_[-\d.]{4,}"), [name for name, _ in views]
+    matches = [view for view in views if view[0] == only] or [view for view in views if frames.fullmatch(view[0])]
+    if not matches:
+        raise SehdrError(f"{path}: has no camera {only!r}{did_you_mean(only, names)}")
+    return matches
 
 
 def check_cameras(cameras: str | Path) -> None:

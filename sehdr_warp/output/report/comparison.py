@@ -72,7 +72,7 @@ def darker_stops(comparisons: Sequence[Comparison]) -> int:
     return int(np.clip(np.floor(np.log2(_GREY / max(white, 1e-9))), _DARKEST, -1))
 
 
-class Opening(NamedTuple):
+class FirstPicture(NamedTuple):
     """Stops from the exposure, title and lead with which a report shows photo and scene first."""
 
     stops: int
@@ -80,15 +80,15 @@ class Opening(NamedTuple):
     lead: str
 
 
-def opening_of(comparison: Comparison) -> Opening:
+def first_picture(comparison: Comparison) -> FirstPicture:
     """Return how a report opens: as dark as shows the light above white, or as the photo was taken if there is none."""
     stops = darker_stops([comparison])
     if not stops:
         lead = f"View {comparison.name}, in which the scene shows next to no light above the photo's white."
-        return Opening(0, "Photo and scene", lead)
+        return FirstPicture(0, "Photo and scene", lead)
     darker = f"{-stops} stop{'s' * (stops < -1)} darker"
     lead = f"View {comparison.name}, {darker}. What the photo clipped stays flat."
-    return Opening(stops, "Light above white", lead)
+    return FirstPicture(stops, "Light above white", lead)
 
 
 def compare(run: "RenderableScene", view: View, views: Sequence[View], scale: float = 1.0) -> Comparison:

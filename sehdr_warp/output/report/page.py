@@ -22,7 +22,7 @@ from ..light_pictures import SPLIT, dial, img, jpeg_source, photo_for_display, s
 from ..lighting.lights import uncertain_lights
 from ..lighting.unit import luminance_of_one, read_light_unit
 from ..world_transform import WorldTransform, world_transform
-from .comparison import Comparison, opening_of
+from .comparison import Comparison, first_picture
 from .diagrams import camera_map, training_svg
 
 if TYPE_CHECKING:
@@ -51,13 +51,13 @@ def report_page(
         run: The trained run.
         scene: What it was trained on.
         comparisons: Views to show.
-        brightest: The view with the most light above white, for the opening and the brackets.
+        brightest: The view with the most light above white, for the first picture and the brackets.
         held_out: Whether the views were not trained on.
         evaluation: Result of evaluate(), for the table of held-out views.
         lights: The lights of the scene, as from run.find_lights().
     """
     sections = [
-        _header(run, scene, _opening(brightest)),
+        _header(run, scene, _first_picture(brightest)),
         _pictures(run, comparisons, held_out),
         _brackets(brightest),
         _lights(lights, luminance_of_one(run), world_transform(run)) if lights else EMPTY,
@@ -90,8 +90,8 @@ def _views(figures: Sequence[Markup]) -> Markup:
     return markup('<div class="views">{}</div>', join(figures))
 
 
-def _header(run: "Run", scene: Scene, opening: Markup) -> Markup:
-    """Return title, opening picture and figures of the training."""
+def _header(run: "Run", scene: Scene, picture: Markup) -> Markup:
+    """Return title, first picture and figures of the training."""
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     times = sorted({view.exposure_time for view in scene.train_views or scene.views})
@@ -120,7 +120,7 @@ def _header(run: "Run", scene: Scene, opening: Markup) -> Markup:
         '</header>\n{}\n<ul class="facts">{}</ul>{}',
         scene.name,
         f"Trained on {device}." if device else "The training has not ended.",
-        opening,
+        picture,
         items,
         markup("<ul>{}</ul>", notes) if notes else EMPTY,
     )
@@ -154,9 +154,9 @@ def _pictures(run: "Run", comparisons: Sequence[Comparison], held_out: bool) -> 
     return _section("Photo, scene, truth" if has_truth else "Photo and scene", lead, _views(figures))
 
 
-def _opening(comparison: Comparison) -> Markup:
+def _first_picture(comparison: Comparison) -> Markup:
     """Return the picture that a reader sees first: photo and scene side by side, as dark as shows their difference."""
-    stops, title, lead = opening_of(comparison)
+    stops, title, lead = first_picture(comparison)
     figures = []
     for name, light in (("Photo", comparison.from_photo), ("Scene", comparison.hdr)):
         small = smaller(light, _PICTURE)

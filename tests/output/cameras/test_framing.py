@@ -3,10 +3,10 @@ import pytest
 
 from sehdr_warp.output.cameras.framing import (
     default_path,
-    film_camera,
-    film_size,
     frame_subject,
     subject_radius,
+    widescreen_camera,
+    widescreen_size,
 )
 from sehdr_warp.output.cameras.opening import opening_view
 from sehdr_warp.output.cameras.paths import orbit, walk, walk_path
@@ -42,7 +42,7 @@ def test_the_subject_fits_into_every_picture(tmp_path):
     assert subject_radius(run, photos, np.zeros(3)) == pytest.approx(1, abs=0.15)
     # These photos show three quarters of the ball at a time.
     photos = around(24, 4, fov=24)
-    path = [film_camera(each, photos) for each in orbit(photos, 8, 1.0)]
+    path = [widescreen_camera(each, photos) for each in orbit(photos, 8, 1.0)]
     edge = np.array([np.asarray(run.render(each.within(96)).alpha)[0].max() for each in path])
     assert edge.min() > 0.5
     framed = frame_subject(run, path, photos)
@@ -57,7 +57,7 @@ def test_a_path_shows_little_more_than_its_photos(tmp_path):
     run = ball(tmp_path)
     for span, height in ((360, 2 * 0.75), (90, 1.0)):
         photos = around(24, 4, span=span, fov=12)
-        path = [film_camera(each, photos) for each in orbit(photos, 6, 1.0)]
+        path = [widescreen_camera(each, photos) for each in orbit(photos, 6, 1.0)]
         for each in frame_subject(run, path, photos):
             assert each.height / each.fy == pytest.approx(height * photos[0].height / photos[0].fy)
             assert each.fx == pytest.approx(each.fy)
@@ -65,7 +65,7 @@ def test_a_path_shows_little_more_than_its_photos(tmp_path):
 
 def test_a_floater_in_the_way_is_passed(tmp_path, logged):
     photos = around(24, 4)
-    path = [film_camera(each, photos) for each in orbit(photos, 24, 1.0)]
+    path = [widescreen_camera(each, photos) for each in orbit(photos, 24, 1.0)]
     # Just in front of one camera of the path.
     run = ball(tmp_path, extra=[(0.92 * path[6].position, 0.15)])
     framed = frame_subject(run, path, photos)
@@ -81,14 +81,14 @@ def test_a_floater_in_the_way_is_passed(tmp_path, logged):
     "short, size", [(24, (640, 360)), (480, (1280, 720)), (900, (1920, 1080)), (3000, (1920, 1080))]
 )
 def test_sizes_of_films(short, size):
-    assert film_size([camera(width=short * 2, height=short)]) == size
+    assert widescreen_size([camera(width=short * 2, height=short)]) == size
 
 
 @pytest.mark.parametrize("width, fx", [(32, 40.0), (64, 40.0), (32, 60.0)])
 def test_a_path_has_square_pixels_and_shows_no_more_than_photos_that_have_not(width, fx):
     """Camera paths of Nuke and nerfstudio state one focal length, and films have no pixel aspect ratio."""
     photo = Camera(width, 24, fx, 44.0, width / 2 + 1, 10.0, np.eye(4))
-    film = film_camera(photo, [photo])
+    film = widescreen_camera(photo, [photo])
     assert film.fx == film.fy
     sides = [side / focal for side, focal in ((film.width, film.fx), (film.height, film.fy))]
     assert sides == pytest.approx([min(sides[0], width / fx), min(sides[1], 24 / 44)])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.output.cameras.framing import film_camera
+from sehdr_warp.output.cameras.framing import widescreen_camera
 from sehdr_warp.output.cameras.opening import opening_facts, opening_view
 from sehdr_warp.scene import Camera
 
@@ -17,7 +17,7 @@ def test_a_page_opens_nearer_than_photos_from_afar_and_farther_than_close_ups(tm
     opening = opening_view(run)
     assert opening is not None and (opening.width, opening.height) == (640, 360)
     assert any(np.allclose(opening.position, photo.position) for photo in photos)
-    film = film_camera(photos[0], photos)
+    film = widescreen_camera(photos[0], photos)
     assert film.fx / opening.fx == pytest.approx(change, rel=0.02)
     assert opening.world_to_camera[0, 1] == pytest.approx(0, abs=1e-9)
 

@@ -22,7 +22,7 @@ from PIL import Image
 from sehdr_warp import output
 from sehdr_warp.output.images.tonemap import display_gain
 from sehdr_warp.output.notebook import run_html
-from sehdr_warp.output.report.comparison import Comparison, darker_stops, opening_of
+from sehdr_warp.output.report.comparison import Comparison, darker_stops, first_picture
 from sehdr_warp.output.report.diagrams import training_svg
 from sehdr_warp.output.report.write import write_report
 from sehdr_warp.output.world_transform import world_transform
@@ -231,7 +231,7 @@ def test_no_markup_is_made_but_by_the_one_function(path):
         assert name != "Markup" or path.name == "html.py", f"{path.name}:{node.lineno}"
 
 
-def test_the_opening_shows_what_photos_clip_as_grey():
+def test_the_first_picture_shows_what_photos_clip_as_grey():
     flat = np.full((4, 4, 3), 2.0)
     thumbnail = Comparison("v", np.ones((4, 4, 3)), flat, flat * 30, 0.5, 1.0)
     # White of 2 s^-1 for half a second is an exposure of 1: two stops darker it is a quarter.
@@ -239,20 +239,20 @@ def test_the_opening_shows_what_photos_clip_as_grey():
     assert darker_stops([replace(thumbnail, gain=8.0)]) == -5
     times = [darker_stops([replace(thumbnail, exposure_time=time)]) for time in (1e-9, 1e9)]
     assert times == [-1, -12]
-    assert opening_of(thumbnail).lead == "View v, 2 stops darker. What the photo clipped stays flat."
+    assert first_picture(thumbnail).lead == "View v, 2 stops darker. What the photo clipped stays flat."
 
 
 def test_a_photo_that_clips_nothing_is_opened_as_it_was_taken():
     flat = np.full((4, 4, 3), 0.5)
-    opening = opening_of(Comparison("v", flat, flat, flat, 0.5, 1.0))
-    assert (opening.stops, opening.title) == (0, "Photo and scene") and "next to no light" in opening.lead
+    first = first_picture(Comparison("v", flat, flat, flat, 0.5, 1.0))
+    assert (first.stops, first.title) == (0, "Photo and scene") and "next to no light" in first.lead
 
 
 def test_a_scene_without_light_above_white_is_not_opened_dark():
     white, flat = np.ones((4, 4, 3)), np.full((4, 4, 3), 2.0)
-    assert opening_of(Comparison("v", white, flat, flat, 0.5, 1.0)).title == "Photo and scene"
+    assert first_picture(Comparison("v", white, flat, flat, 0.5, 1.0)).title == "Photo and scene"
     steep = flat * [[[1.0, 1.0, 0.01]]]  # Of a code just below white, which a steep response decodes to far less
-    assert opening_of(Comparison("v", white, steep, flat, 0.5, 1.0)).title == "Photo and scene"
+    assert first_picture(Comparison("v", white, steep, flat, 0.5, 1.0)).title == "Photo and scene"
 
 
 def test_times_of_a_short_training_are_at_their_places():
