@@ -21,6 +21,7 @@ CLIPPED = 0.3  # Share of the values of photos too bright for a Gaussian that cl
 BRIGHT = 0.7  # Times white, from which a Gaussian can belong to a light, and from which a photo is too bright for it
 MOST_CLIPPED = 0.1  # Share of all photos' pixels that may clip at the exposure whose white decides what a light is
 LEAST_SEEN = 0.3  # Pixels of blending weight over all views, likewise
+LEAST_MEASURED = 0.05  # Pixels likewise over darker photos that do not clip, from which these measure a Gaussian
 CORE, CORE_BRIGHT = 0.75, 0.5  # Of a light's share that clips, or brightness, from which Gaussians count for its shape
 EXTENT, WHOLE = 2.0, 0.95  # A photo holds a light if this share of its weight lies within, out to so many widths
 LEAST_SHARE = 5e-4  # Of the light at the middle of the cameras, if nothing hides the light from there
@@ -48,6 +49,7 @@ class Light:
             not clip, it is at most MEASURED_STOPS, or what the scene differs from unclipped values.
         share: of the light that reaches the middle of the training cameras, with what hides it from there.
         members: [K] int64, its Gaussians.
+        measured: share of what clips of it that photos of half the exposure or less show unclipped.
     """
 
     shape: LightShape
@@ -56,6 +58,7 @@ class Light:
     deviation: float | None
     share: float
     members: Tensor
+    measured: float = 0.0
 
 
 def light_name(index: int) -> str:
@@ -156,10 +159,12 @@ def find_lights(
         radiance = fit_solid_angles(shape, light_photos.light, places)
         if radiance.mean() * shape.solid_angle(middle) < LEAST_SHARE * total:
             continue
-        deviation = _deviation(group, float(photos.measurable[light_photos.photos].max()))
+        of_clipped = group.weights * np.maximum(group.clipped, 1e-6)
+        deviation = None if group.stops is None else float(np.average(_deviations(group), weights=of_clipped))
+        measured = float(np.average(group.measured, weights=of_clipped))
         share = float(reaches_middle[group.index].sum()) / total
         bound = np.minimum(_certain_radiance(group, photos), radiance)
-        lights.append(Light(shape, radiance, bound, deviation, share, group.index))
+        lights.append(Light(shape, radiance, bound, deviation, share, group.index, measured))
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
 
 
@@ -171,7 +176,7 @@ class _Photos:
         cameras: of the photos, in the scene's coordinates.
         received: by each photo.
         white: radiance that lights exceed.
-        measurable: [V] radiance up to which a photo measures what photos of that white clip; 0 if it clips as early.
+        measured: [N] sums of the pixels in photos of at least twice that white that show most of a Gaussian unclipped.
         focal: typical focal length, pixels.
         whites: [V] radiance that each photo clips at.
         pixels: [N] sums over the photos.
@@ -181,7 +186,7 @@ class _Photos:
     cameras: list[Camera]
     received: list[ReceivedLight]
     white: float
-    measurable: np.ndarray
+    measured: Tensor
     focal: float
     whites: np.ndarray
     pixels: Tensor
@@ -199,6 +204,7 @@ class _Candidates:
         weights: [K] radiance times pixels.
         brightness: [K] radiance of the brightest channel.
         too_bright: [K] whether a photo of the usual exposure clips it.
+        measured: [K] whether photos of half that exposure or less do not clip it.
         clipped: [K] in [0, 1], which share of its values clips.
         stops: [K] deviation of log2 radiance, of its whole light; None if it was not measured.
         doubt: [K] stops of its confidence.
@@ -212,6 +218,7 @@ class _Candidates:
     weights: np.ndarray
     brightness: np.ndarray
     too_bright: np.ndarray
+    measured: np.ndarray
     clipped: np.ndarray
     stops: np.ndarray | None
     doubt: np.ndarray
@@ -225,19 +232,10 @@ class _Candidates:
 
     def rows(self, rows: np.ndarray) -> "_Candidates":
         """Return some of the Gaussians."""
-        return _Candidates(
-            index=self.index[torch.from_numpy(rows).to(self.index.device)],
-            positions=self.positions[rows],
-            axes=self.axes[rows],
-            weights=self.weights[rows],
-            brightness=self.brightness[rows],
-            too_bright=self.too_bright[rows],
-            clipped=self.clipped[rows],
-            stops=None if self.stops is None else self.stops[rows],
-            doubt=self.doubt[rows],
-            angles=self.angles[:, rows],
-            light=self.light[:, rows],
-        )
+        index = self.index[torch.from_numpy(rows).to(self.index.device)]
+        parts = {"index": index, "angles": self.angles[:, rows], "light": self.light[:, rows]}
+        others = {name: value for name, value in vars(self).items() if name not in parts}
+        return _Candidates(**parts, **{name: None if value is None else value[rows] for name, value in others.items()})
 
 
 class _LightPhotos(NamedTuple):
@@ -268,16 +266,10 @@ def _measure_photos(field: RadianceField, views: Sequence[tuple[Camera, float]],
     radiance = light / angles.clamp_min(1e-20)[:, None]
     most = field.response.white / float(np.quantile(times, 0.75, method="lower"))
     white = _reference_white(np.minimum(whites, most), radiance.amax(1), pixels)
-    return _Photos(
-        cameras=cameras,
-        received=received,
-        white=white,
-        measurable=np.where(whites >= 2 * white, whites, 0.0),
-        focal=typical_focal_length(cameras),
-        whites=whites,
-        pixels=pixels,
-        radiance=radiance,
-    )
+    dark = [(camera, limit) for camera, limit in zip(cameras, whites, strict=True) if limit >= 2 * white]
+    unclipped = (_unclipped_by(field, camera, limit, degree) for camera, limit in dark)
+    measured = reduce(torch.add, unclipped, torch.zeros_like(pixels))
+    return _Photos(cameras, received, white, measured, typical_focal_length(cameras), whites, pixels, radiance)
 
 
 def _candidates(field: RadianceField, clipped: Tensor, photos: _Photos) -> _Candidates:
@@ -302,6 +294,7 @@ def _candidates(field: RadianceField, clipped: Tensor, photos: _Photos) -> _Cand
         weights=(photos.pixels * photos.radiance.mean(1))[index].cpu().numpy(),
         brightness=peak[index].cpu().numpy(),
         too_bright=(too_bright > 0)[index].cpu().numpy(),
+        measured=(photos.measured > LEAST_MEASURED)[index].cpu().numpy(),
         clipped=clipped.to(device)[index].cpu().numpy(),
         stops=None if stops is None else stops.to(device)[index].cpu().numpy(),
         doubt=-confidence[index].clamp_min(2.0**-8).log2().cpu().numpy(),
@@ -317,16 +310,12 @@ def _whole_photos(cameras: Sequence[Camera], group: _Candidates, core: _Candidat
     return _LightPhotos(photos, core.angles.sum(1)[photos], group.light.sum(1)[photos])
 
 
-def _deviation(group: _Candidates, measurable: float) -> float | None:
-    """Return the deviation of a light's log2 radiance, stops, if photos measure radiance up to a value."""
-    if group.stops is None:
-        return None
-    clipped = np.maximum(group.clipped, 1e-6)
-    stops = group.stops / clipped
+def _deviations(group: _Candidates) -> np.ndarray:
+    """Return the deviations [K] of log2 radiance, stops, of what clips of a light."""
+    stops = group.stops / np.maximum(group.clipped, 1e-6)
     # The scene may contradict the photos that measure it.
     misfit = np.maximum(group.doubt - group.stops, 0) / np.maximum(1 - group.clipped, 1e-6)
-    stops = np.where(group.brightness < measurable, np.minimum(stops, np.maximum(misfit, MEASURED_STOPS)), stops)
-    return float(np.average(stops, weights=group.weights * clipped))
+    return np.where(group.measured, np.minimum(stops, np.maximum(misfit, MEASURED_STOPS)), stops)
 
 
 def _certain_radiance(group: _Candidates, photos: _Photos) -> np.ndarray:
@@ -380,6 +369,17 @@ def _received_by(
     sums = field.weighted_sums(field.camera_tensors(camera), images, opacities)
     radiance = field.radiance_towards(camera.position, degree=degree)
     return ReceivedLight(sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit))
+
+
+def _unclipped_by(field: RadianceField, camera: Camera, white: float, degree: int | None) -> Tensor:
+    """Return the pixels [N] of each Gaussian that a camera shows, 0 if most of them are as bright as its white.
+
+    A Gaussian that blends with darker ones may be brighter than all pixels.
+    """
+    image = field.render(camera, degree=degree).hdr.amax(2).to(field.gaussians.means.device)
+    images = torch.stack([torch.ones_like(image), (image < white).to(image)], 2)
+    pixels, unclipped = field.weighted_sums(field.camera_tensors(camera), images).unbind(1)
+    return torch.where(unclipped > pixels / 2, pixels, 0)
 
 
 def _in_frame(camera: Camera, positions: np.ndarray, longest: np.ndarray, weights: np.ndarray) -> bool:

@@ -245,7 +245,22 @@ def test_a_light_is_sure_if_a_darker_photo_shows_it_unclipped(darker, direction,
     turned = look_at(camera.position, np.add(camera.position, (0, 0, direction)), up=(0, -1, 0))
     dark = (Camera(256, 192, 240.0, 240.0, 128.0, 96.0, turned), time / darker)
     (light,) = find_lights(scene, torch.full((scene.gaussians.count,), 0.75), [*others, dark])
-    assert light.deviation == pytest.approx(stops, rel=0.01)
+    assert light.deviation == pytest.approx(stops, rel=0.01) and light.measured == (stops < 1)
+
+
+def test_a_darker_photo_measures_gaussians_that_are_brighter_than_its_white():
+    """Bright Gaussians among dark ones, which blend to pixels below the white of the dark photo."""
+    places = panel()
+    radiance = np.where(np.arange(len(places))[:, None] % 4 == 0, 4 * RADIANCE, 0.01)
+    scene = field(places, radiance, 0.06)
+    scene.gaussians.opacity_logits.data[:] = -1
+    scene.clipped_stops = torch.full((scene.gaussians.count,), 1.2)
+    *others, (camera, time) = views()
+    limit = float(scene.render(camera).hdr.max())
+    assert radiance.max() > 1.5 * limit
+    for white, stops in ((1.1 * limit, 0.25), (limit / 4, 1.2)):
+        (light,) = find_lights(scene, torch.ones(scene.gaussians.count), [*others, (camera, time / white)])
+        assert light.deviation == pytest.approx(stops, rel=0.01)
 
 
 def photograph(scene, views, truth=None):

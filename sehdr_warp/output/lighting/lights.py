@@ -229,18 +229,23 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
 
 
 def uncertain_lights(lights: Sequence[Any]) -> list[str]:
-    """Return the sentence that names lights of which photos show little, and what measures them; none without them."""
+    """Return the sentences that name uncertain lights and what measures them; none without them."""
     unsure = {light_name(index): light for index, light in enumerate(lights) if (light.deviation or 0) > UNCERTAIN}
-    if not unsure:
-        return []
-    strongest = max(light.share for light in unsure.values())
-    strong = [light for light in unsure.values() if light.share >= STRONG * strongest]
-    radiance = float(np.max([light.radiance for light in strong]))
-    bound = float(np.max([light.lower_bound for light in strong]))
-    stops = max(1, math.ceil(math.log2(max(radiance, 1e-30) / max(bound, 1e-30))))
-    guess = f"{first_names(list(unsure), 5)}: uncertain by more than {UNCERTAIN:g} stops where photos clip"
-    remedy = f"three photos about {stops} stop{'s' * (stops > 1)} darker than the darkest that clip there"
-    return [f"{guess}; {remedy} measure them"]
+    clipped = {name: light for name, light in unsure.items() if light.measured < 0.5}
+    sentences = []
+    if clipped:
+        strongest = max(light.share for light in clipped.values())
+        strong = [light for light in clipped.values() if light.share >= STRONG * strongest]
+        radiance = float(np.max([light.radiance for light in strong]))
+        bound = float(np.max([light.lower_bound for light in strong]))
+        stops = max(1, math.ceil(math.log2(max(radiance, 1e-30) / max(bound, 1e-30))))
+        guess = f"{first_names(list(clipped), 5)}: uncertain by more than {UNCERTAIN:g} stops where photos clip"
+        remedy = f"three photos about {stops} stop{'s' * (stops > 1)} darker than the darkest that clip there"
+        sentences.append(f"{guess}; {remedy} measure them")
+    if names := [name for name in unsure if name not in clipped]:
+        what = f"the scene differs by more than {UNCERTAIN:g} stops from darker photos, which do not clip there"
+        sentences.append(f"{first_names(names, 5)}: {what}; more such photos, or more steps, may bring it closer")
+    return sentences
 
 
 def _describe(name: str, light: Any, transform: WorldTransform, unit: float) -> dict:
