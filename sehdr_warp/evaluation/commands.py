@@ -83,7 +83,7 @@ class Compare:
 def run_evaluate(options: Evaluate) -> None:
     """Evaluate, print the figures and write them."""
     from ..files import check_absent, write_json
-    from .compare import format_table
+    from .compare import eval_table
 
     if options.pictures.truth is None:
         _refuse_unused(options.pictures, PictureOptions(), "needs --truth, the set to compare pictures with")
@@ -105,7 +105,7 @@ def run_evaluate(options: Evaluate) -> None:
         figures = _evaluate_pictures(options, options.pictures.truth)
     if file is not None:
         write_json(file, figures, result.overwrite)
-    print(format_table(figures) if file == result.json else json.dumps(figures))
+    print(eval_table(figures) if file == result.json else json.dumps(figures))
     if file is not None:
         print(file)
 

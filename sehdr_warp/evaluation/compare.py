@@ -1,4 +1,4 @@
-"""Compare trained runs: figures, means over seeds, held-out error against time; and tables of figures."""
+"""Compare trained runs: figures, means over seeds, held-out error; and the tables of `compare` and `eval`."""
 
 import csv
 import io
@@ -145,7 +145,7 @@ def columns(rows: Sequence[Sequence[str]], texts: int = 1) -> list[str]:
     return ["  ".join(side(cell, width) for side, cell, width in zip(sides, row, widths)) for row in rows]
 
 
-def format_table(result: dict) -> str:
+def eval_table(result: dict) -> str:
     """Return the figures of evaluate() as a table for a terminal; missing ones are dashes, with the reasons below."""
     origin = result.get("folder") or (
         f"{result['gaussians']:,} Gaussians, {result['iterations']:,} iterations in {result['train_seconds']:.1f} s"

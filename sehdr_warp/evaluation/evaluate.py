@@ -125,9 +125,8 @@ class Evaluation:
 
     def result(self) -> dict:
         """Return the figures that evaluate() describes."""
-        truths = [view.hdr is not None for view in self.views]
         kind = "training" if self.split == "train" else self.split
-        missing = None if any(truths) else f"the {kind} views hold no HDR truth"
+        missing = None if any(view.hdr is not None for view in self.views) else f"the {kind} views hold no HDR truth"
         scale, scale_reason = (None, missing) if missing else self._scale()
         rows = []
         for number, view in enumerate(self.views, 1):
@@ -140,10 +139,10 @@ class Evaluation:
         for name in PROTOCOLS:
             reason = scale_reason if name == "aligned" else missing
             missing_reason = {"reason": reason} if reason else {}
-            rows_with_truth = [] if reason else [row for row, has_truth in zip(rows, truths) if has_truth]
-            figures = _mean([row["protocol"][name] for row in rows_with_truth], *HDR_FIGURES)
-            hdr[name] = figures | {"views": len(rows_with_truth)} | (missing_reason or self._lpips_reason(figures))
-            pu21[name] = _mean([row["pu21"][name] for row in rows_with_truth], "psnr", "ssim") | missing_reason
+            with_truth = [row for row in rows if name in row["protocol"]]
+            figures = _mean([row["protocol"][name] for row in with_truth], *HDR_FIGURES)
+            hdr[name] = figures | {"views": len(with_truth)} | (missing_reason or self._lpips_reason(figures))
+            pu21[name] = _mean([row["pu21"][name] for row in with_truth], "psnr", "ssim") | missing_reason
         hdr["aligned"]["scale"] = scale
         ldr = _mean([row["ldr"] for row in rows], "psnr", "ssim", "lpips")
         without_photos = {"reason": "the folder holds radiance, no simulated photos"}
@@ -171,7 +170,7 @@ class Evaluation:
         scale = fit_scale(
             (*self._render(view), self._tensor(view.mask), self._tensor(view.image)) for view in self.scale_views
         )
-        return scale, None if scale else "the predictions hold no light to fit the scale on"
+        return (scale, None) if scale else (None, "the predictions hold no light to fit the scale on")
 
     def _render(self, view: View) -> tuple[Tensor, Any]:
         """Return prediction and truth, [H, W, 3] float32 on the device each; the truth may be None."""

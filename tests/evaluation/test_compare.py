@@ -9,7 +9,7 @@ import pytest
 
 import sehdr_warp as sw
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table, format_table
+from sehdr_warp.evaluation.compare import compare_runs, comparison_csv, comparison_latex, comparison_table, eval_table
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.output.images.exr import write_exr
 from sehdr_warp.runs.config import Config
@@ -89,7 +89,7 @@ def test_a_folder_scores_as_a_run_that_renders_it(tmp_path, logged):
     assert ours["ldr"]["psnr"] is None and "no simulated photos" in ours["ldr"]["reason"]
     assert ours["missing"] == ours["extra"] == []
     json.dumps(ours, allow_nan=False)
-    table = format_table(ours)
+    table = eval_table(ours)
     assert str(folder) in table and "LDR" not in table
 
 
@@ -109,7 +109,7 @@ def test_missing_and_extra_files_are_said(tmp_path, logged):
     assert [row["name"] for row in result["views"]] == ["r_3"]
     assert any("1 views have no file: r_2" in line for line in logged)
     assert any("files belong to no view: r_9" in line for line in logged)
-    assert "fitted on what the scored views" in format_table(result)
+    assert "fitted on what the scored views" in eval_table(result)
 
 
 def test_folders_that_cannot_be_scored(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.evaluation.compare import format_table
+from sehdr_warp.evaluation.compare import eval_table
 from sehdr_warp.evaluation.evaluate import evaluate
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, encoded_values
@@ -81,10 +81,10 @@ def test_a_perfect_render_is_strict_json():
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     trained_on = evaluate(run(lambda hdr: hdr * 1.1), scene(VIEWS[:2]))
     assert trained_on["split"] == "train" and len(trained_on["views"]) == 2
-    assert "no test views" in format_table(trained_on)
+    assert "no test views" in eval_table(trained_on)
     lights, remedy = {"count": 3, "lost": 1, "energies": [0.2, 0.9]}, "photos in which it does not clip"
-    assert remedy in format_table(result | {"lights": lights})
-    assert remedy not in format_table(result | {"lights": lights | {"lost": 0}})
+    assert remedy in eval_table(result | {"lights": lights})
+    assert remedy not in eval_table(result | {"lights": lights | {"lost": 0}})
 
 
 def test_a_scene_without_truth_keeps_its_ldr_figures():
@@ -96,7 +96,7 @@ def test_a_scene_without_truth_keeps_its_ldr_figures():
     region = result["regions"]["well-exposed"]
     assert region["psnr_ldr"] > 20 and region["psnr_mu"]["gt-max"] is None and "no HDR truth" in region["reason"]
     json.dumps(result, allow_nan=False)
-    assert "no HDR truth" in format_table(result)
+    assert "no HDR truth" in eval_table(result)
 
 
 def test_truth_of_the_test_views_alone_leaves_out_the_aligned_figures():
@@ -174,6 +174,6 @@ def test_confidence_is_ranked_against_errors():
     doubtful_run.render_confidence = lambda camera: 1 - (doubt - doubt.median()).abs()
     better = evaluate(doubtful_run, scene(VIEWS))
     assert better["confidence"]["spearman_log2"] > 0.8 > result["confidence"]["spearman_log2"]
-    assert "confidence ranks errors: " in format_table(better)
+    assert "confidence ranks errors: " in eval_table(better)
     without = evaluate(doubtful_run, scene([view(0, "train", truth=False), view(1, "test", truth=False)]))
     assert without["confidence"]["spearman_log2"] is None and "no HDR truth" in without["confidence"]["reason"]
