@@ -154,7 +154,7 @@ def encoding_of(image: Image.Image) -> ColorEncoding | None:
     if profile := image.info.get("icc_profile"):
         return encoding_of_profile(bytes(profile), "GRAY" if image.mode in _GREY else "RGB")
     if image.format == "PNG":
-        return None if "srgb" in image.info else _from_gama(image.info)
+        return None if "srgb" in image.info else _from_gama(image.info) or _from_exif(image)
     if image.format == "TIFF":
         return _from_tiff(image)
     return _from_exif(image)

@@ -270,14 +270,15 @@ def test_photos_of_one_name_in_several_folders_are_counted_each(tmp_path):
     assert notes == ["colors: 6 of 6 photos are in P3 (ICC profile) and converted to Rec.709 (0000.png ...)"]
 
 
-@pytest.mark.parametrize("interop", [{0xA001: 2}, {0xA001: 0xFFFF, "index": "R03"}])
-def test_adobe_rgb_of_exif(tmp_path, interop):
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+@pytest.mark.parametrize("table", [{0xA001: 2}, {0xA001: 0xFFFF, 0xA005: {1: "R03"}}])
+def test_adobe_rgb_of_exif(tmp_path, table, suffix):
     exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA001] = interop[0xA001]
-    if "index" in interop:
-        exif.get_ifd(0x8769)[0xA005] = {1: interop["index"]}
-    Image.fromarray(np.full((8, 8, 3), PATCHES[0], np.uint8)).save(tmp_path / "a.jpg", exif=exif, quality=100)
-    with open_image(tmp_path / "a.jpg") as image:
+    exif[271] = "camera"  # Pillow writes no EXIF whose first table is empty.
+    exif.get_ifd(0x8769).update(table)
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(np.full((8, 8, 3), PATCHES[0], np.uint8)).save(path, exif=exif, quality=100)
+    with open_image(path) as image:
         encoding = encoding_of(image)
     light, _ = encoding.to_linear(np.array([[PATCHES[0]]], np.uint8))
     np.testing.assert_allclose(light[0, 0], rec709_of("Adobe RGB (1998)", 563 / 256, PATCHES[0]), rtol=2e-3)
