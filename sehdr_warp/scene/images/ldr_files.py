@@ -154,16 +154,18 @@ def open_image(path: Path, *, mask: bool = False) -> ImageFile.ImageFile:
             raise InputError(path, f"is not a readable {'HEIC photo' if heif else 'image'}{detail}", DAMAGED) from None
         finally:
             Image.MAX_IMAGE_PIXELS = limit
+    mode = image.mode
     try:
         if image.format == "TIFF":
+            if (image.tag_v2.get(262), image.tag_v2.get(259)) == (6, 1):  # pyright: ignore[reportAttributeAccessIssue]
+                mode = "YCbCr"  # Pillow 11 says RGB.
             # Pillow turns a TIFF upright when it loads it, and states that size before, by which it misreads grey.
             image._size = tuple(image.tag_v2[tag] for tag in (256, 257))  # pyright: ignore[reportAttributeAccessIssue]
         check_size(path, *image.size)
         if several:
             raise InputError(path, "holds several pictures, pages or an animation", "save the one that counts")
-        if image.mode not in (*_MODES, *("1" * mask)):
-            mode = _OTHER_MODES.get(image.mode, f"{image.mode}, not RGB")
-            raise InputError(path, f"holds {mode}", _EXPORT)
+        if mode not in (*_MODES, *("1" * mask)):
+            raise InputError(path, f"holds {_OTHER_MODES.get(mode, f'{mode}, not RGB')}", _EXPORT)
     except InputError:
         image.close()
         raise
