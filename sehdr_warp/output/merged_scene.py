@@ -13,7 +13,7 @@ from ..runs.run import RenderableScene, on_device
 from ..splats import GaussianArrays
 from ..splats.arrays import join_gaussians
 from .cameras.scene_cameras import camera_positions, training_cameras
-from .world_transform import WorldTransform, from_photos
+from .world_transform import WorldTransform, photos_to_scene
 
 
 class MergedScene(RenderableScene):
@@ -71,7 +71,7 @@ def _to_coordinates_of(first: RenderableScene, scene: RenderableScene) -> WorldT
     """Return the map from a scene's coordinates to those of the first scene, by what their files state."""
     if scene is first:
         return WorldTransform.identity()
-    return WorldTransform.from_matrix(from_photos(first).matrix @ from_photos(scene).inverse().matrix)
+    return WorldTransform.from_matrix(photos_to_scene(first).matrix @ photos_to_scene(scene).inverse().matrix)
 
 
 def _joined_gaussians(scenes: Sequence[RenderableScene], moves: Sequence[WorldTransform]) -> GaussianArrays:

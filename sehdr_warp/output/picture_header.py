@@ -10,7 +10,7 @@ from ..scene import Camera
 from .images.colorspace import color_space
 from .images.exr import exr_header
 from .lighting.unit import luminance_of_one, read_light_unit
-from .world_transform import WorldTransform, stored_matrix
+from .world_transform import WorldTransform, photos_to_file
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -41,7 +41,7 @@ class PictureHeader:
     @staticmethod
     def of(run: "RenderableScene", transform: WorldTransform, colorspace: str) -> "PictureHeader":
         """Return the header of pictures of a run that are made now; `transform` leads to the files' coordinates."""
-        facts = provenance(run) | {"worldMatrix": json.dumps(stored_matrix(run, transform).tolist())}
+        facts = provenance(run) | {"worldMatrix": json.dumps(photos_to_file(run, transform).tolist())}
         now = datetime.now().replace(microsecond=0)
         return PictureHeader(run.base_time, colorspace, now, facts, luminance_of_one(run))
 

@@ -23,7 +23,7 @@ from .images.ocio import ocio_view
 from .images.tonemap import ToneMap, exposure_of_white, fit_tone_map
 from .picture_header import PictureHeader
 from .view_images import ViewImages, data_parts, read_aovs, render_images
-from .world_transform import WorldTransform, from_photos, stored_matrix, world_transform
+from .world_transform import WorldTransform, photos_to_file, photos_to_scene, world_transform
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -151,9 +151,8 @@ def render_views(
             if images.alpha.mean() < _LEAST_ALPHA:
                 empty.append(name)
     if empty:
-        names = first_names(empty, 5)
         problem = "see nothing of the scene, or next to nothing: are they in its coordinates, and do they look at it?"
-        log.warning("%d of %d cameras (%s) %s", len(empty), len(views), names, problem)
+        log.warning("%d of %d cameras (%s) %s", len(empty), len(views), first_names(empty, 5), problem)
     files = [out / place.format(name) for place in ("hdr/{}.exr", "preview/{}.png") for name, _ in views]
     if brackets is not None:
         files += [*brackets.files(), out / "brackets.json"]
@@ -205,11 +204,11 @@ def _camera_files(
         return {}
     cameras = [(name, transform.camera(camera)) for name, camera in pinholes]
     moving = camera_path(cameras) if moves else None
-    files = {"cameras.usda": usd_cameras(cameras, stored_matrix(run, transform), path=moving, fps=fps)}
+    files = {"cameras.usda": usd_cameras(cameras, photos_to_file(run, transform), path=moving, fps=fps)}
     if moving is not None:
         files["cameras.chan"] = chan_cameras(moving)
         # nerfstudio's dataparser_transforms.json starts from the photos' coordinates.
-        to_photos = from_photos(run).inverse()
+        to_photos = photos_to_scene(run).inverse()
         files["camera_path.json"] = nerfstudio_path([to_photos.camera(camera) for _, camera in pinholes], fps)
     return files
 

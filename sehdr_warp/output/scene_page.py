@@ -111,8 +111,7 @@ def write_scene_page(
     ]
     body = page_markup("scene.html", title=run.scene_name, data=join(blocks, "\n"))
     own = "".join(map(page_file, ("tables.js", "light.js", "camera.js", "scene.js")))
-    scripts = [page_file("playcanvas.min.js"), own]
-    page = whole_page(run.scene_name, page_file("scene.css"), body, scripts, workers=True)
+    page = whole_page(run.scene_name, page_file("scene.css"), body, [page_file("playcanvas.min.js"), own], workers=True)
     with atomic_path(path, overwrite) as temporary:
         temporary.write_text(page, encoding="utf-8")
     log.info("%s: %d Gaussians, %.1f MB; light above white stays", path.name, gaussians.count, len(page) / 1e6)

@@ -1,7 +1,7 @@
 """The similarity from a scene's coordinates to those of files: upright, and scaled to meters.
 
-    photos' coordinates  -- from_photos() -->  scene's coordinates  -- world_transform() -->  coordinates of files
-    photos' coordinates  ------------------------ stored_matrix() ---------------------->  coordinates of files
+    photos' coordinates  -- photos_to_scene() -->  scene's coordinates  -- world_transform() -->  coordinates of files
+    photos' coordinates  --------------------------- photos_to_file() ------------------------->  coordinates of files
 
 A scene's coordinates are those of its cameras and renders: the photos' own for a run, the file's for a file of
 Gaussians. Pictures, Gaussians, maps, lights, meshes, cameras.usda and .chan share the transform, so that they line up
@@ -124,7 +124,7 @@ def world_transform(
     if axes == "scene":
         if up is not None:
             raise SehdrError("--up turns the scene upright, and --axes scene leaves it as it is; leave one of them out")
-        factor, to_photos = _checked_scale(scale), from_photos(run).inverse()
+        factor, to_photos = _checked_scale(scale), photos_to_scene(run).inverse()
         return WorldTransform(to_photos.rotation, factor * to_photos.translation, factor * to_photos.scale)
     by_gps = None if run.up is None else run.up.unit
     factor = _checked_scale(next((each for each in (scale, orientation.scale, by_gps) if each is not None), None))
@@ -152,12 +152,12 @@ def world_transform(
     return WorldTransform(rotation, -factor * (rotation @ origin), factor)
 
 
-def from_photos(run: "RenderableScene") -> WorldTransform:
+def photos_to_scene(run: "RenderableScene") -> WorldTransform:
     """Return the transform from the photos' coordinates to the scene's, which a file of Gaussians may state."""
     return WorldTransform.identity() if run.world_matrix is None else WorldTransform.from_matrix(run.world_matrix)
 
 
-def stored_matrix(run: "RenderableScene", transform: WorldTransform) -> np.ndarray:
+def photos_to_file(run: "RenderableScene", transform: WorldTransform) -> np.ndarray:
     """Return the [4, 4] that a file states: from the photos' coordinates to its own, which `transform` leads to."""
     return transform.matrix if run.world_matrix is None else transform.matrix @ run.world_matrix
 

@@ -17,7 +17,7 @@ from ..output.images.tonemap import display_gain
 from ..output.light_pictures import curve_table
 from ..output.lighting.unit import luminance_of_one
 from ..output.merged_scene import merge_scenes
-from ..output.world_transform import from_photos, world_transform
+from ..output.world_transform import photos_to_scene, world_transform
 from ..scene import Camera
 from .edits import EditedOpacities, LightGains
 from .scene_lock import SceneLock
@@ -232,6 +232,6 @@ def frame_bytes(camera: Camera, clipped: bool) -> int:
 
 def camera_file(run: Any, cameras: Sequence[Camera]) -> str:
     """Return cameras of a page as JSON that `render --cameras` reads, in the photos' coordinates."""
-    digits, to_photos = max(3, len(str(len(cameras) - 1))), from_photos(run).inverse()
+    digits, to_photos = max(3, len(str(len(cameras) - 1))), photos_to_scene(run).inverse()
     views = [{"name": f"view_{i:0{digits}d}"} | to_photos.camera(camera).to_dict() for i, camera in enumerate(cameras)]
     return json.dumps({"cameras": views}, indent=1)

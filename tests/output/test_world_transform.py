@@ -14,7 +14,13 @@ from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.lighting.environment_map import write_environment_map
 from sehdr_warp.output.render_views import render_views
-from sehdr_warp.output.world_transform import WorldTransform, from_photos, scene_up, world_transform, write_orientation
+from sehdr_warp.output.world_transform import (
+    WorldTransform,
+    photos_to_scene,
+    scene_up,
+    world_transform,
+    write_orientation,
+)
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera, load_cameras, load_scene, look_at
 from sehdr_warp.scene.gravity import UpDirection, is_pitch_known, up_direction
@@ -217,7 +223,7 @@ def test_pictures_and_maps_of_a_turned_file_state_the_way_from_the_photos(tmp_pa
     place = photos.points(json.loads(header["sehdr:position"]))
     np.testing.assert_allclose(place, cameras[1].camera.position, atol=1e-6)
     path = [each for _, each in select_cameras(file, "interpolate", count=3)]
-    to_photos, own = from_photos(file).inverse(), [entry.camera for entry in file.cameras]
+    to_photos, own = photos_to_scene(file).inverse(), [entry.camera for entry in file.cameras]
     for source, scene, expected in (
         ("out/cameras.usda", file, path),
         ("out/camera_path.json", file, path),

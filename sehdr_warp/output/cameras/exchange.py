@@ -105,8 +105,7 @@ def usd_cameras(
     else:
         times = _TIMES.format(first=path.frames[0], last=path.frames[-1], fps=f"{fps:.10g}")
         prims = [_usd_camera(_identifiers([path.name])[0], path.cameras, path.frames)]
-    world_key = '"' + USD_WORLD_MATRIX + '"'
-    return _STAGE.format(world_key=world_key, world=world, times=times, cameras="\n".join(prims))
+    return _STAGE.format(world_key=f'"{USD_WORLD_MATRIX}"', world=world, times=times, cameras="\n".join(prims))
 
 
 def chan_cameras(path: CameraPath) -> str:

@@ -14,7 +14,7 @@ from ...scene.readers.camera_exchange import EXCHANGE_SUFFIXES
 from ...scene.readers.camera_files import read_camera_file
 from ...splats import cameras_beside
 from ..images.ldr_files import safe_names
-from ..world_transform import WorldTransform, from_photos, world_transform
+from ..world_transform import WorldTransform, photos_to_scene, world_transform
 from .framing import default_path, widescreen_camera
 from .paths import interpolate
 from .scene_cameras import training_cameras
@@ -80,7 +80,7 @@ def _from_file(
 ) -> list[tuple[str, Camera]]:
     """Return the cameras of a file, or `only` the one of this name, in the scene's coordinates."""
     file = read_camera_file(path)
-    views, to_scene = file.cameras, [from_photos(run)]  # Most files are in the photos' coordinates.
+    views, to_scene = file.cameras, [photos_to_scene(run)]  # Most files are in the photos' coordinates.
     if file.world_matrix is not None:
         try:
             to_scene.insert(0, WorldTransform.from_matrix(file.world_matrix).inverse())

@@ -32,7 +32,7 @@ from ...subsets import every_nth, first_names
 from ..brackets import remove_earlier
 from ..cameras.scene_cameras import camera_positions, training_cameras
 from ..images.tonemap import display_gain
-from ..world_transform import WorldTransform, file_transform, is_y_down, stored_matrix, world_transform
+from ..world_transform import WorldTransform, file_transform, is_y_down, photos_to_file, world_transform
 from .splat_edits import SplatEdits, most_visible, without_strays
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def export(
     part = _select_rows(run, whole, mask, edits, display_time)
     written = part if to_file.is_identity else part.transformed(to_file.matrix)
     if run.world_matrix is not None:
-        written = replace(written, world_matrix=stored_matrix(run, to_file))
+        written = replace(written, world_matrix=photos_to_file(run, to_file))
     written = written.padded(degree or 0)
     write_gaussians(path, written, overwrite=overwrite)
     if cameras:

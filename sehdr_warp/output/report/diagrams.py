@@ -82,10 +82,7 @@ def camera_map(run: "RenderableScene", tone_map: Any, names: Sequence[str] = ())
     width, height = (_MAP_SIZE * (high - low + margin) / size).tolist()
 
     def place(at: np.ndarray) -> np.ndarray:
-        return np.stack([(at[..., 0] - low[0]) / size, (at[..., 1] - low[1]) / size], -1) * [1, -1] * _MAP_SIZE + [
-            0,
-            height,
-        ]
+        return (at - low) / size * [1, -1] * _MAP_SIZE + [0, height]
 
     elements = [_ground(place(ground), tone_map(colors), round(width), round(height))] if len(ground) else []
     for entry, at in zip(entries, place(positions)):

@@ -95,14 +95,13 @@ def _header(run: "Run", scene: Scene, picture: Markup) -> Markup:
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
     camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
     times = sorted({view.exposure_time for view in scene.train_views or scene.views})
-    span = " to ".join(shutter(time) for time in sorted({times[0], times[-1]}))
+    span = " to ".join(shutter(time) for time in sorted({times[0], times[-1]})).replace(" s to", " to")
+    exposure = "exposure" if run.exposure_compensation is None else "exposure, compensated"
     facts = {
         "photos trained on": len(scene.train_views),
         "photos held out": len(scene.test_views),
         "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
-        "exposure" if run.exposure_compensation is None else "exposure, compensated": span.replace(
-            " s to", " to"
-        ).replace(" s", "\N{NO-BREAK SPACE}s"),
+        exposure: span.replace(" s", "\N{NO-BREAK SPACE}s"),
         "response": run.response.name,
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
         "steps": run.iterations,

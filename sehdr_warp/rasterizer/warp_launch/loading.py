@@ -1,4 +1,4 @@
-"""Initialize Warp; compile and load its kernels for the CPU."""
+"""Initialize Warp, as soon as this module is imported; compile and load its kernels for the CPU."""
 
 import os
 import threading
