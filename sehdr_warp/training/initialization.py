@@ -2,13 +2,12 @@
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ..errors import InputError, SehdrError, refuse_paths
 from ..model.baking import field_of, gaussians_of, to_normalized
@@ -18,21 +17,19 @@ from ..model.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name
 from ..runs.config import Config
 from ..runs.run import assemble_field
-from ..scene import Camera, Scene, View
+from ..scene import Scene, View
 from ..scene.normalization import Normalization, normalization_of
 from ..scene.response_choice import select_for_views
-from ..scene.wide_camera import perspective_views, pixels_of_directions
+from ..scene.wide_camera import perspective_views
 from ..splats import read_gaussians
-from ..splats.arrays import HARMONIC_0
 from ..subsets import counted, every_nth
-from .matching import WHITE_TOLERANCE, Matcher, at_matching_size, estimates_at
+from .matching import Matcher, at_matching_size
 from .strategies import mcmc_cap
 from .strategies.mcmc import MAX_DISTANCE
 
 _log = logging.getLogger(__name__)
 
 MOST_DEPTHS = 100_000  # Largest number of points that the range of depths is estimated from
-MOST_BRIGHTENED_BY = 100  # Photos whose estimates of clipped light are averaged
 FEWEST_POINTS = 20  # With fewer points, random ones are added, and depths follow the cameras' focus
 FEWEST_RANDOM = 5000  # Smallest number of random points
 _NO_AGREEMENT = (
@@ -288,55 +285,3 @@ def colors_in_views(points: np.ndarray, views: tuple[View, ...]) -> tuple[np.nda
         visible[inside] += 1
         total[inside] += view.image[row[inside].astype(int), column[inside].astype(int)]
     return visible, total / np.maximum(visible, 1)[:, None]
-
-
-def sizes_of(scene: Scene, gaussians: int | None = None) -> tuple[int, int, int]:
-    """Return the number of Gaussians, by default that of the points, and width and height of the largest photo."""
-    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
-    return len(scene.points) if gaussians is None else gaussians, camera.width, camera.height
-
-
-@torch.no_grad()
-def brighten_clipped(field: RadianceField, views: Sequence[View], estimates: Sequence[Tensor]) -> None:
-    """Brighten the Gaussians of a field at iteration 0 that are white, to the light that photos expect there.
-
-    An optimizer moves the logarithm of a color by its learning rate. In short trainings, or for lamps that few photos
-    show, that is too slow to reach a lamp a hundred times as bright as white from white.
-
-    Photos agree by the weights of their estimates, as in the loss. A channel that is not white stays as it is.
-
-    Args:
-        field: Its constant colors are those of photos.
-        views: Training views, in the field's normalized coordinates.
-        estimates: ClippedLight.log_light [h, w, 6] of each view.
-    """
-    gaussians, model = field.gaussians, field.color_model
-    values = gaussians.harmonics_dc[:, 0] * HARMONIC_0
-    white = torch.from_numpy(model.start(np.ones((1, 3)), field.response)).to(values)
-    is_white = values >= white - WHITE_TOLERANCE
-    index = is_white.any(1).nonzero()[:, 0]
-    points, sums, weights = gaussians.means[index], 0.0, torch.full((len(index), 3), 1e-12).to(values)
-    for view, estimate in every_nth(list(zip(views, estimates, strict=True)), MOST_BRIGHTENED_BY):
-        if len(index) and bool(estimate.any()):
-            positions = _image_positions(view.camera, points)
-            inside = ((positions >= 0) & (positions < 1)).all(1)
-            x, y = torch.where(inside[:, None], positions, 0).T
-            cells = estimates_at(estimate.to(values), x, y)
-            weight = cells[:, 3:].square() * inside[:, None]
-            sums = sums + weight * (cells[:, :3] + math.log(field.base_time / view.exposure_time))
-            weights += weight
-    excess = torch.where(is_white[index], (sums / weights).clamp_min(0), 0)
-    gaussians.harmonics_dc[index, 0] = model.brighten(values[index], excess) / HARMONIC_0
-
-
-def _image_positions(camera: Camera, points: Tensor) -> Tensor:
-    """Return where a camera's image shows points [N, 3]: [N, 2] x and y, in [0, 1) within it, or NaN."""
-    pose = torch.tensor(camera.world_to_camera).to(points)
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    if camera.is_pinhole:
-        focal, middle = points.new_tensor([[camera.fx, camera.fy], [camera.cx, camera.cy]])
-        pixels = torch.where(local[:, 2:] > 1e-9, local[:, :2] / local[:, 2:] * focal + middle, math.nan)
-    else:
-        directions = (local / local.norm(dim=1, keepdim=True).clamp_min(1e-12)).cpu().numpy()
-        pixels = torch.tensor(pixels_of_directions(directions, camera)[:, ::-1] + 0.5).to(points)
-    return pixels / points.new_tensor([camera.width, camera.height])

@@ -1,32 +1,21 @@
 """Points of the surfaces that photos show: a plane sweep (Collins 1996) for individually chosen pixels.
 
-A training starts from such points, and seed_gaussians() adds Gaussians where a photo is reproduced worst, at depths on
-which photos agree.
+A training starts from such points (initialization.py), and adds Gaussians at others (seeding.py).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
-from ..model.color_models import ColorModel
-from ..model.radiance_field import RadianceField
 from ..parallel import prefetch_map
-from ..rasterizer.losses.code_residual import sample_residual_pixels
 from ..rasterizer.ops.plane_sweep import BORDER, NEIGHBORS, PhotoSet, matched_points, matching_costs, trusted_depths
 from ..response import Response
 from ..scene import Camera, View, codes_of
-from ..splats.arrays import HARMONIC_0
-from .strategies import Proposals
-from .strategies.mcmc import MAX_DISTANCE
-from .training_views import TrainingView
 
-WHITE_TOLERANCE = 1e-4  # Of values of the harmonics' constant part that are compared with that of white
 LARGEST_SIDE = 800  # Photos are matched at this size at most: depths need no more pixels
 RESIZED_AT_ONCE = 8  # Photos that are resized in parallel
 PLANES = 48, 256  # Smallest and largest number of depths to try; within these they are a pixel of parallax apart
@@ -47,9 +36,6 @@ MIDTONE, LEAST_EXPONENT = 0.3, 0.4
 absolute margins, so without it most depths of dark photos count as equally good."""
 ALIKE = 0.05  # Photos whose exposures differ by fewer stops are compared as they are
 CHUNK = 1 << 20  # Costs held at one time
-MAX_SEEDS = 500  # Gaussians per refinement
-INITIAL_OPACITY = 0.5  # Of a seeded Gaussian; high enough for the training to shape them
-MIN_ERROR = 0.02  # Mean difference of encoded values above which a pixel can be seeded
 
 
 @dataclass(frozen=True)
@@ -251,87 +237,3 @@ def _parallax(cameras: Sequence[Camera], neighbors: np.ndarray, near: float, far
     apart = np.linalg.norm(positions[:, None] - positions[neighbors], axis=2) * focal[:, None]
     apart = apart[neighbors >= 0]
     return float(np.median(apart)) * (1 / near - 1 / far) if len(apart) else 0.0
-
-
-@torch.no_grad()
-def seed_gaussians(
-    field: RadianceField,
-    matcher: Matcher,
-    rendered: Tensor,
-    view: TrainingView,
-    index: int,
-    number: Tensor,
-    bound: int,
-    random_seed: int,
-) -> Proposals:
-    """Return new Gaussians at pixels sampled by their squared error. Does not wait for the device.
-
-    Args:
-        field: The field that is trained.
-        matcher: Matcher of the training photos.
-        rendered: [H, W, 3] the view as the scene renders it, encoded.
-        view: The view.
-        index: Index of the view in the matcher.
-        number: int64 [], number of Gaussians.
-        bound: Upper bound of `number` on the host.
-        random_seed: Seed of the sampling.
-    """
-    bound = min(bound, MAX_SEEDS) if min(matcher.size(index)) > 2 * BORDER else 0
-    uniform, target = torch.from_numpy(np.random.default_rng(random_seed).random(bound)), view.target
-    if rendered.device.type == "cuda":
-        uniform = uniform.pin_memory().to(rendered.device, non_blocking=True)
-    pixels, sampled = sample_residual_pixels(
-        rendered, target.codes, target.index, target.mask, uniform, index, matcher.size(index), least=MIN_ERROR
-    )
-    matches, valid = matcher.match_each(pixels)
-    valid &= sampled & (torch.arange(bound, device=valid.device) < number)
-    starts = _start_values(field.color_model, field.response, matches.colors.device)
-    start = starts.gather(0, (matches.colors * 255).round().long())
-    if target.estimates is not None:
-        times = field.base_time / float(view.exposure_time)
-        excess = expected_excess(target.estimates, pixels[:, 1:].long(), matcher.size(index), times)
-        is_white = start >= starts[-1] - WHITE_TOLERANCE
-        start = field.color_model.brighten(start, torch.where(is_white, excess, 0))
-    rest = field.gaussians.harmonics_rest
-    nearer = (MAX_DISTANCE / matches.points.norm(dim=1)).clamp_max(1.0)
-    quaternions = torch.zeros(bound, 4, device=rest.device)
-    quaternions[:, 0] = 1
-    rows = {
-        "means": matches.points * nearer[:, None],
-        "log_scales": (matches.footprints * nearer).log()[:, None].repeat(1, 3),
-        "quaternions": quaternions,
-        "opacity_logits": rest.new_full((bound,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
-        "harmonics_dc": (start / HARMONIC_0).to(rest)[:, None, :],
-        "harmonics_rest": rest.new_zeros(bound, *rest.shape[1:]),
-    }
-    order = valid.byte().argsort(descending=True, stable=True)
-    return Proposals({name: values[order] for name, values in rows.items()}, valid.sum())
-
-
-@lru_cache(maxsize=1)
-def _start_values(model: ColorModel, response: Response, device: torch.device) -> Tensor:
-    """Return [256, 3] start values of the harmonics' constant part for each 8-bit code."""
-    levels = np.arange(256, dtype=np.float32)[:, None].repeat(3, 1) / np.float32(255)
-    return torch.from_numpy(model.start(levels, response)).to(device)
-
-
-def expected_excess(estimate: Tensor, pixels: Tensor, size: tuple[int, int], times: float = 1.0) -> Tensor:
-    """Return [N, 3] the logarithm, at least 0, of the expected light over white at a photo's pixels.
-
-    It is 0 where nothing is known. Does not wait for the device.
-
-    Args:
-        estimate: ClippedLight.log_light [h, w, 6] of the photo.
-        pixels: [N, 2] int64 column and row; others than the photo has count as the nearest.
-        size: Width and height of the photo.
-        times: The exposure time whose white is meant, over that of the photo.
-    """
-    x, y = ((pixels[:, axis] + 0.5) / size[axis] for axis in (0, 1))
-    light, root = estimates_at(estimate, x, y).float().split(3, dim=1)
-    return torch.where(root > 0, (light + math.log(times)).clamp_min(0), 0)
-
-
-def estimates_at(estimates: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Return estimates [h, w, C] at image positions x, y [N] in [0, 1), the nearest beyond."""
-    rows, columns = estimates.shape[:2]
-    return estimates[(y * rows).long().clamp(0, rows - 1), (x * columns).long().clamp(0, columns - 1)]

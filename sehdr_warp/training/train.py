@@ -24,13 +24,14 @@ from ..runs.values import LoadArguments
 from ..scene import Scene
 from ..scene.normalization import Normalization, normalization_of
 from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
-from .initialization import brighten_clipped, make_field, make_matcher, response_for_training, sizes_of
+from .initialization import make_field, make_matcher, response_for_training
 from .machine import summary_writer
 from .plan import check_fields, make_plan
 from .ranks import Ranks
 from .run_output import RunOutput
 from .scene_facts import check_scene_truth
-from .trainer import Trainer
+from .seeding import brighten_clipped
+from .trainer import Trainer, sizes_of
 from .training_state import load_state, state_of
 from .workers import send_training, several_ranks_notes
 
@@ -154,7 +155,7 @@ def _new_trainer(
         plan = replace(plan, decisions=(*plan.decisions, estimate.decision))
     photos = scene if compensation is None else compensation.normalize_photos(scene, response)
     normalized = normalization.scene(photos)
-    # One matcher for compensation, initial points and seeded Gaussians; made when it is needed, because it takes long.
+    # One matcher for compensation, initial points and seeds; made when it is needed, because it takes long.
     get_matcher = cache(lambda: matcher or make_matcher(normalized, response, device))
     field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
     trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks)

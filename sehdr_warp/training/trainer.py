@@ -30,16 +30,17 @@ from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
 from .data_manager import DataManager, PhotoSampler
 from .gradient_step import GradientStep, StepOptions, StepResult
-from .initialization import make_matcher, sizes_of
+from .initialization import make_matcher
 from .losses import INTERVALS_FROM
 from .machine import interruptible, torch_settings
-from .matching import Matcher, seed_gaussians
+from .matching import Matcher
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .scene_facts import is_large
+from .seeding import make_seeds
 from .step_graphs import StepGraphs
-from .strategies import SEED_STRIDE, Proposals, make_strategy
+from .strategies import SEED_STRIDE, Seeds, make_strategy
 from .training_state import TrainingProgress
 
 log = logging.getLogger(__name__)
@@ -260,19 +261,19 @@ class Trainer:
         """Refine the Gaussians; on several ranks, rank 0 does and the others receive the result."""
         gaussians, strategy, ranks = self.field.gaussians, self.strategy, self.ranks
         count, reallocations = gaussians.count, gaussians.reallocations
-        propose = self._propose_gaussians if self._can_seed else None
+        make_seeds = self._make_seeds if self._can_seed else None
         if ranks is not None:
             ranks.reduce_to_main(list(strategy.state_dict(count).values()))
         changed = (ranks is None or ranks.is_main_process) and strategy.refine(
-            self.iteration, gaussians, self.optimizer, self.generator, propose, self.step_batch
+            self.iteration, gaussians, self.optimizer, self.generator, make_seeds, self.step_batch
         )
         if ranks is not None:
             changed = ranks.broadcast_refined(changed, strategy, gaussians, self.optimizer)
         if changed:
             self.graphs.adapt(count, reallocations, self.iteration)
 
-    def _propose_gaussians(self, number: Tensor, bound: int) -> Proposals:
-        """Propose new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
+    def _make_seeds(self, number: Tensor, bound: int) -> Seeds:
+        """Make new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
         random_seed = self.config.seed * SEED_STRIDE + self.iteration
         view, result = self.data_manager.views[self._view_index], self._result
         assert result is not None and self._get_matcher is not None
@@ -281,7 +282,7 @@ class Trainer:
             if view.target.scale.compares_exposures:
                 image = self.field.response.encode_extended(image)
             matcher, index = self._get_matcher(), self._view_index
-            return seed_gaussians(self.field, matcher, image, view, index, number, bound, random_seed)
+            return make_seeds(self.field, matcher, image, view, index, number, bound, random_seed)
 
     @property
     def degree(self) -> int:
@@ -376,3 +377,9 @@ class Trainer:
         with self.graphs.on_capture_stream():
             view = self.field.render(camera, degree=self.degree)
         return as_rec709(view, self.scene.color_matrix, self.field)
+
+
+def sizes_of(scene: Scene, gaussians: int | None = None) -> tuple[int, int, int]:
+    """Return the number of Gaussians, by default that of the points, and width and height of the largest photo."""
+    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
+    return len(scene.points) if gaussians is None else gaussians, camera.width, camera.height

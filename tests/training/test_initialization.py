@@ -24,14 +24,13 @@ from sehdr_warp.splats import write_gaussians
 from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.initialization import (
     base_time,
-    brighten_clipped,
     colors_in_views,
     focus_distance,
     make_field,
     random_points,
     response_for_training,
 )
-from sehdr_warp.training.matching import expected_excess
+from sehdr_warp.training.seeding import brighten_clipped, expected_excess
 from sehdr_warp.training.train import create_trainer
 
 from ..splats.test_splat_files import gaussians

@@ -16,7 +16,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
-from sehdr_warp.training.matching import seed_gaussians
+from sehdr_warp.training.seeding import make_seeds
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.training_views import ViewDataset
 
@@ -123,12 +123,12 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
         photo = field.render_train_view(views[0].camera, views[0].exposure_time, degree=0).encoded
     budget = torch.tensor(200, device=device)
     inputs = field, matcher, photo, views[0], 0
-    (rows, born), (again, roomy) = (seed_gaussians(*inputs, budget, room, random_seed=3) for room in (200, 300))
+    (rows, born), (again, roomy) = (make_seeds(*inputs, budget, room, random_seed=3) for room in (200, 300))
     assert 0 < int(born) < 200 and born == roomy
     rows, again = ({name: values[: int(born)] for name, values in each.items()} for each in (rows, again))
     assert all(torch.equal(values, again[name]) for name, values in rows.items())
     assert all(values.isfinite().all() for values in rows.values())
-    none = seed_gaussians(*inputs, torch.tensor(0, device=device), 10, random_seed=3)
+    none = make_seeds(*inputs, torch.tensor(0, device=device), 10, random_seed=3)
     assert not int(none[1])
     white = rows["harmonics_dc"].amax((1, 2)) == rows["harmonics_dc"].max()
     depth = torch.from_numpy(field.normalization.scene_points(rows["means"][white].cpu().numpy())[:, 2])
@@ -139,7 +139,7 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     # White ones are born at the light that the photo is expected to hold.
     held = torch.full((16, 16, 6), math.log(50), dtype=torch.float16, device=device)
     lit = replace(views[0], target=replace(views[0].target, estimates=held))
-    brighter = seed_gaussians(field, matcher, photo, lit, 0, budget, 200, random_seed=3).rows["harmonics_dc"]
+    brighter = make_seeds(field, matcher, photo, lit, 0, budget, 200, random_seed=3).rows["harmonics_dc"]
     rise = (brighter[: int(born)] - rows["harmonics_dc"])[:, 0] * HARMONIC_0
     torch.testing.assert_close(rise, math.log(50) * white[:, None].expand_as(rise), rtol=2e-3, atol=1e-5)
 

@@ -10,7 +10,7 @@ from sehdr_warp.model.gaussians import PARAMETER_NAMES, Gaussians, rotate
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.rasterizer.ops.relocation import relocation_sums
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.training.strategies import Proposals, make_strategy, mcmc
+from sehdr_warp.training.strategies import Seeds, make_strategy, mcmc
 from sehdr_warp.training.strategies.adc import sample_half
 from sehdr_warp.training.strategies.mcmc import sample_rows
 
@@ -281,7 +281,7 @@ def proposer(colors):
         dc = torch.tensor(colors)[:, None, None].expand(-1, 1, 3)
         proposed |= {"means": torch.zeros_like(proposed["means"]), "harmonics_dc": dc}
         rows = {name: values[:room].contiguous() for name, values in proposed.items()}
-        return Proposals(rows, asked_count.clamp_max(len(colors)))
+        return Seeds(rows, asked_count.clamp_max(len(colors)))
 
     return propose
 

@@ -10,15 +10,15 @@ from torch import Tensor
 
 from ...runs.config import Config
 from .adc import AdcStrategy
-from .base import SEED_STRIDE, Proposals, Propose, Schedule, Strategy
+from .base import SEED_STRIDE, MakeSeeds, Schedule, Seeds, Strategy
 from .mcmc import DENSE, McmcStrategy, mcmc_cap
 
 __all__ = [
     "SEED_STRIDE",
     "AdcStrategy",
+    "MakeSeeds",
     "McmcStrategy",
-    "Proposals",
-    "Propose",
+    "Seeds",
     "Strategy",
     "make_strategy",
     "mcmc_cap",

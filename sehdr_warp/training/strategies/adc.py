@@ -10,7 +10,7 @@ from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, rotate
 from ...rasterizer import Rendering
 from ...rasterizer.ops.step_updates import add_gradient_statistics
 from ...runs.config import AdcConfig
-from .base import Propose, Strategy
+from .base import Strategy
 
 SPLIT_SHRINK = 1.6  # Factor by which the two halves of a split are smaller (3DGS: 0.8 times the number of halves)
 MIN_RESET_INTERVAL = 300
@@ -49,15 +49,7 @@ class AdcStrategy(Strategy):
         add_gradient_statistics(gradients, rendering.radii, usable, width, height, self.gradient_sum, self.photo_count)
 
     @torch.no_grad()
-    def refine(
-        self,
-        iteration: int,
-        gaussians: Gaussians,
-        optimizer: Optimizer | None,
-        generator: torch.Generator,
-        propose: Propose | None = None,
-        step_batch: int = 1,
-    ) -> bool:
+    def refine(self, iteration, gaussians, optimizer, generator, make_seeds=None, step_batch=1) -> bool:
         """Duplicate, split and remove Gaussians, and reset opacities, if this iteration is due."""
         changed = False
         total, count = self.gradient_sum, self.photo_count

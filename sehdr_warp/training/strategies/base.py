@@ -18,15 +18,15 @@ RESERVE_FACTOR = 1.17  # Reserved rows as a multiple of the count: room for thre
 SEED_STRIDE = 1_000_003  # A step's random seed is that of the training times this, plus the iteration
 
 
-class Proposals(NamedTuple):
-    """New Gaussians to place."""
+class Seeds(NamedTuple):
+    """New Gaussians where a photo is reproduced worst, see seeding.make_seeds()."""
 
     rows: dict[str, Tensor]  # Tensors [M, ...] as Gaussians.append() takes them; the first `count` rows are to be used
     count: Tensor  # Int64 [] on the device
 
 
-Propose = Callable[[Tensor, int], Proposals]
-"""Returns up to a number of new Gaussians: int64 [] on the device, and its upper bound on the host."""
+MakeSeeds = Callable[[Tensor, int], Seeds]
+"""Makes up to a number of seeds: int64 [] on the device, and its upper bound on the host."""
 
 
 @dataclass
@@ -96,17 +96,17 @@ class Strategy:
         gaussians: Gaussians,
         optimizer: Optimizer | None,
         generator: torch.Generator,
-        propose: Propose | None = None,
+        make_seeds: MakeSeeds | None = None,
         step_batch: int = 1,
     ) -> bool:
-        """Change the Gaussians and their optimizer state if this iteration is due.
+        """Change the Gaussians and their optimizer state, after a step for which is_due() is true.
 
         Args:
             iteration: Iterations done.
             gaussians: The Gaussians.
             optimizer: Their optimizer.
             generator: Source of random numbers, on the Gaussians' device.
-            propose: Returns new Gaussians where photos are reproduced worst.
+            make_seeds: Makes new Gaussians; None to add copies alone.
             step_batch: Photos of the step, one for each rank; each counts as an iteration.
 
         Returns:

@@ -17,7 +17,7 @@ from ...rasterizer.ops.relocation import (
 )
 from ...rasterizer.ops.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
-from .base import SEED_STRIDE, Propose, Strategy
+from .base import SEED_STRIDE, MakeSeeds, Strategy
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
 DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
@@ -62,23 +62,13 @@ class McmcStrategy(Strategy):
     dense: bool = False  # Whether copies take over the second moments of their source, see reset_moments()
 
     @torch.no_grad()
-    def refine(
-        self,
-        iteration: int,
-        gaussians: Gaussians,
-        optimizer: Optimizer | None,
-        generator: torch.Generator,
-        propose: Propose | None = None,
-        step_batch: int = 1,
-    ) -> bool:
-        """Relocate dead Gaussians and add new ones, if this iteration is due.
+    def refine(self, iteration, gaussians, optimizer, generator, make_seeds=None, step_batch=1) -> bool:
+        """Relocate dead Gaussians and add new ones.
 
-        The slots are filled from the first on: [0, seeded) by seeding, [seeded, dead_count) by copies of living
+        The slots are filled from the first on: [0, seeded) by seeds, [seeded, dead_count) by copies of living
         Gaussians, and the new rows that are left, up to dead_count + added, by copies sampled by opacity. Only the
         device knows how many Gaussians are dead, so these counts stay there.
         """
-        if not self.is_due(iteration, step_batch):
-            return False
         count = gaussians.count
         opacities = gaussians.opacities()
         added = self.next_count(iteration, count) - count
@@ -89,7 +79,7 @@ class McmcStrategy(Strategy):
         gaussians.resize(count + added, optimizer)
         changed = torch.zeros_like(slot_of_row, dtype=torch.bool)
         refinement = Refinement(gaussians, optimizer, generator, slot_of_row, changed)
-        seeded = self.fill_proposals(refinement, dead_count, added, propose)
+        seeded = self.place_seeds(refinement, dead_count, added, make_seeds)
         self.relocate(refinement, opacities.masked_fill(dead, 0), seeded, dead_count, count)
         if added > 0:
             first = torch.maximum(dead_count, seeded)
@@ -110,16 +100,16 @@ class McmcStrategy(Strategy):
             growth = max(growth, min((self.cap_max / count) ** (1 / remaining) - 1, MAX_GROWTH))
         return max(count, min(self.cap_max, math.ceil((1 + growth) * count)))
 
-    def fill_proposals(self, refinement: Refinement, dead_count: Tensor, added: int, propose: Propose | None) -> Tensor:
-        """Fill the first slots with seeded Gaussians; return their number, int64 []."""
+    def place_seeds(self, refinement: Refinement, dead_count: Tensor, added: int, make: MakeSeeds | None) -> Tensor:
+        """Fill the first slots with seeds; return their number, int64 []."""
         fraction, none = self.options.seed_fraction, torch.zeros_like(dead_count)
-        if propose is None or not fraction:
+        if make is None or not fraction:
             return none
         number = (fraction * (dead_count + added).double()).long()
         bound = host_bound(number, int(fraction * refinement.gaussians.count))
         if not bound:
             return none
-        rows, seeded = propose(number, bound)
+        rows, seeded = make(number, bound)
         values = list(refinement.gaussians.tensors().values())
         rows = [rows[name] for name in PARAMETER_NAMES]
         copy_rows(values, rows, refinement.slot_of_row, none, seeded, changed=refinement.changed)
