@@ -14,7 +14,7 @@ from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.scene import Scene
 from sehdr_warp.training.initialization import make_field, response_for_training
-from sehdr_warp.training.machine import torch_settings
+from sehdr_warp.training.process_settings import torch_settings
 from sehdr_warp.training.ranks import Ranks
 from sehdr_warp.training.trainer import Trainer
 

@@ -18,7 +18,7 @@ from sehdr_warp.parallel import thread_count
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.launch import RankInfo, device_of_rank
-from sehdr_warp.training.machine import torch_settings
+from sehdr_warp.training.process_settings import torch_settings
 from sehdr_warp.training.ranks import GO, Ranks, join_ranks
 
 from .results import check, new_result
@@ -118,7 +118,7 @@ def _time_steps(ranks: Ranks | None, size: Size, device: torch.device, repetitio
         wait(device)
         mean = (time.perf_counter() - started) * 1e3 / (STEPS * repetitions)
         whole = amortize(trainer, step)["amortized_ms"]
-        trainer.gather()  # Raises an error if the Gaussians of the ranks differ.
+        trainer.sync_ranks()  # Raises an error if the Gaussians of the ranks differ.
     return {"photo_ms": mean / photos, "amortized_ms": whole / photos, "repetitions": STEPS * repetitions}
 
 

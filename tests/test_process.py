@@ -12,7 +12,7 @@ import pytest
 from sehdr_warp import process
 from sehdr_warp.errors import InputError, SehdrError, UsageError, as_user_error, flags_in_messages
 from sehdr_warp.process import _Stream, collect_late
-from sehdr_warp.training.machine import interruptible
+from sehdr_warp.training.process_settings import interruptible
 
 
 @pytest.mark.parametrize(

@@ -283,7 +283,7 @@ class ReservedRows:
 
     A CUDA graph fixes the addresses and the row counts of its tensors. It therefore runs on all reserved rows; those
     beyond the count are Gaussians of opacity 0, which no camera sees. Their moments and gradients are 0, so no step
-    changes them. StepGraphs reserves them, a gradient step sees all_rows(), and everything else the first `count`.
+    changes them. StepRunner reserves them, a gradient step sees all_rows(), and everything else the first `count`.
 
     Attributes:
         rows: Number of rows.

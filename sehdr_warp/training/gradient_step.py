@@ -1,7 +1,7 @@
 """One gradient step on a photo: forward, loss, backward, average over the ranks, optimizer step.
 
 GradientStep.run() is the whole step. Nothing in it waits for the device if the number of intersections has a fixed
-capacity, so that StepGraphs can capture it as a CUDA graph; on several GPUs, as one graph before and one after the
+capacity, so that StepRunner can capture it as a CUDA graph; on several GPUs, as one graph before and one after the
 average.
 """
 
@@ -28,6 +28,10 @@ from .ranks import Ranks
 from .scene_facts import largest_hdr_truth
 from .strategies import SEED_STRIDE, Strategy
 from .training_views import TrainingView
+
+SKIPPED, MOST_INTERSECTIONS, OVERFLOWED = range(3)
+"""Of GradientStep.step_counters: steps that were not finite, the largest number of intersections, and steps with more
+intersections than the capacity. Neither kind of step is applied."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +134,7 @@ class GradientStep:
         optimizer: Adam over its parameters.
         strategy: Densification strategy, which accumulates gradients of projected means.
         ranks: Processes that train together.
-        step_counters: [3] int64, which each step adds to: steps that were not finite; largest number of intersections,
-            set to 0 by GraphCapacity; steps with more intersections than the capacity. Neither kind of step is applied.
+        step_counters: [3] int64, which each step adds to: see SKIPPED. GraphCapacity sets the second one to 0.
         defer_sh_gradients: Keep the gradients of the harmonics in factored form until the optimizer step: a gradient by
             one color per Gaussian in place of 48 numbers; see HarmonicsGradients for their way.
     """

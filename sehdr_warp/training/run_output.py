@@ -22,7 +22,7 @@ from ..runs.config import Config, ScheduleConfig
 from ..runs.run import Run, load_run
 from ..runs.run_writer import RunWriter, write_confidence
 from ..scene import View
-from .machine import machine_figures, summary_writer
+from .process_settings import machine_figures, summary_writer
 from .training_state import state_of
 
 if TYPE_CHECKING:

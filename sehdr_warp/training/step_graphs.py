@@ -16,7 +16,7 @@ from ..errors import SehdrError
 from ..rasterizer import CudaGraphRunner
 from ..rasterizer.memory import failed_allocation
 from .data_manager import DeviceViews, PhotoStream
-from .gradient_step import GradientStep, GraphKey, StepOptions, StepResult
+from .gradient_step import MOST_INTERSECTIONS, GradientStep, GraphKey, StepOptions, StepResult
 from .training_views import ViewStack
 
 HEADROOM = 1.25  # Capacity as a multiple of the largest count; the photos of a scene differ by a factor of up to 1.32
@@ -26,7 +26,7 @@ MIN_CAPACITY = 1 << 14
 MAX_RESERVE = 1.5  # Largest number of reserved rows as a multiple of the count; they cost memory and a little time
 
 
-class StepGraphs:
+class StepRunner:
     """Runs gradient steps: as CUDA graphs if that is possible, else kernel by kernel, as on a CPU.
 
     On one GPU, a step is one graph. On several, it is two, and gradients are averaged between.
@@ -206,10 +206,10 @@ class GraphCapacity:
         Returns whether the captured graphs can be kept: if the Gaussians stayed in the same memory, and the capacity is
         at least MIN_HEADROOM times the expected number.
         """
-        needed = self._counted or int(self.step_counters[1]) or self._expected
+        needed = self._counted or int(self.step_counters[MOST_INTERSECTIONS]) or self._expected
         # The lower bound does not grow: new Gaussians are small, so intersections grow more slowly than the count.
         self._expected = math.ceil(max(needed * growth, MIN_SHRINK * self._expected))
-        self.step_counters[1].zero_()
+        self.step_counters[MOST_INTERSECTIONS].zero_()
         self._counted = 0
         if same_memory and self._capacity >= MIN_HEADROOM * self._expected:
             return True

@@ -25,8 +25,8 @@ from ..scene import Scene
 from ..scene.normalization import Normalization, normalization_of
 from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from .initialization import make_field, make_matcher, response_for_training
-from .machine import summary_writer
 from .plan import check_fields, make_plan
+from .process_settings import summary_writer
 from .ranks import Ranks
 from .run_output import RunOutput
 from .scene_facts import check_scene_truth

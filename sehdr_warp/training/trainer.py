@@ -6,7 +6,7 @@ training_state.py lists what a checkpoint holds. On several ranks, each runs thi
 
 A gradient step is GradientStep.run(). Its compute_gradients() calls RadianceField.render_train_view() -> rasterize()
 (kernels project, tiles, blend_cuda or blend_cpu), then data_loss() and differentiate(); its apply_gradients() calls
-decide_step() -> Adam.step() (on a GPU, kernels step_updates). On a GPU, StepGraphs.run() captures it as a CUDA graph;
+decide_step() -> Adam.step() (on a GPU, kernels step_updates). On a GPU, StepRunner.run() captures it as a CUDA graph;
 a replay repeats its kernels. create_trainer() writes the checkpoint of iteration 0, before the first step.
 """
 
@@ -29,17 +29,17 @@ from ..runs.run import Run, as_rec709
 from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
 from .data_manager import DataManager, PhotoSampler
-from .gradient_step import GradientStep, StepOptions, StepResult
+from .gradient_step import OVERFLOWED, SKIPPED, GradientStep, StepOptions, StepResult
 from .initialization import make_matcher
 from .losses import INTERVALS_FROM
-from .machine import interruptible, torch_settings
 from .matching import Matcher
 from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
+from .process_settings import interruptible, torch_settings
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .scene_facts import is_large
 from .seeding import make_seeds
-from .step_graphs import StepGraphs
+from .step_graphs import StepRunner
 from .strategies import SEED_STRIDE, Seeds, make_strategy
 from .training_state import TrainingProgress
 
@@ -102,7 +102,6 @@ class Trainer:
         self.device = field.gaussians.means.device
         self.total = config.schedule.iterations
         self.iteration, self.first_iteration, self.step_batch, self.seconds = 0, 0, 1, 0.0
-
         normalized = field.normalization.scene(scene)
         views = normalized.train_views
         self.optimizer = make_optimizer(field, config, self.batch)
@@ -125,8 +124,8 @@ class Trainer:
         field.gaussians.release()  # Another trainer of this field may have reserved rows for its own optimizer.
         self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, ranks, self.large_scene)
         use_cuda_graph = config.schedule.use_cuda_graph
-        self.graphs = StepGraphs(self.gradient_step, enabled=use_cuda_graph, deterministic=config.deterministic)
-        self.data_manager = DataManager(views, field, config, use_cuda_graph=self.graphs.enabled)
+        self.step_runner = StepRunner(self.gradient_step, enabled=use_cuda_graph, deterministic=config.deterministic)
+        self.data_manager = DataManager(views, field, config, use_cuda_graph=self.step_runner.enabled)
         self._result: StepResult | None = None  # Of the last step
         self._view_index = 0  # Training view of the last step
         # Why no further step follows: a signal, stop(), another rank that has ended
@@ -183,10 +182,7 @@ class Trainer:
             yield
 
     def _agree_to_continue(self) -> bool:
-        """Return whether there is a next step; any rank may end the training, and rank 0 may pause() it.
-
-        Other ranks repeat the exchange while rank 0 is in pause(); without ranks there is no exchange.
-        """
+        """Return whether there is a next step. Any rank may end the training, and rank 0 may make the others wait."""
         agreed = END if self._ranks_ended else WAIT
         while agreed == WAIT:
             agreed = GO if self.iteration < self.total and not self.ending else END
@@ -209,8 +205,8 @@ class Trainer:
     def _finish(self) -> None:
         """Save the end of the training; after the last step, also measure the scene on the training photos."""
         self.synchronize()
-        self.gather()
-        self.check()
+        self.sync_ranks()
+        self.check_skipped_steps()
         if self.output is not None:
             self.output.save_end(self)
         if self.ranks is not None:
@@ -242,7 +238,7 @@ class Trainer:
 
         # Forward, loss, backward, optimizer step: GradientStep.run().
         views, following = self.data_manager.views, self.sampler.peek()
-        self._result = self.graphs.run(views, self._view_index, following, options, self.iteration)
+        self._result = self.step_runner.run(views, self._view_index, following, options, self.iteration)
         # Densification.
         self.strategy.inject_noise(self.iteration, self.field.gaussians, means_lr)
         if self.strategy.is_due(self.iteration, self.step_batch):
@@ -251,11 +247,11 @@ class Trainer:
             self._get_matcher = None  # Its copies of the photos take memory on the device.
         # Moving average; after the last step, it replaces the Gaussians.
         self.average.update(self.iteration, self.step_batch, self.field.gaussians)
-        # Checks; a checkpoint after this step holds what the ranks gather here.
+        # Checks; a checkpoint after this step holds what the ranks sum here.
         if self.came_to(CHECK_EVERY):
-            self.check(wait=False)
+            self.check_skipped_steps(wait=False)
         if self.came_to(COMPARE_EVERY) or self.came_to(self.config.checkpoint_interval):
-            self.gather()
+            self.sync_ranks()
 
     def _densify(self) -> None:
         """Refine the Gaussians; on several ranks, rank 0 does and the others receive the result."""
@@ -270,14 +266,14 @@ class Trainer:
         if ranks is not None:
             changed = ranks.broadcast_refined(changed, strategy, gaussians, self.optimizer)
         if changed:
-            self.graphs.adapt(count, reallocations, self.iteration)
+            self.step_runner.adapt(count, reallocations, self.iteration)
 
     def _make_seeds(self, number: Tensor, bound: int) -> Seeds:
         """Make new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""
         random_seed = self.config.seed * SEED_STRIDE + self.iteration
         view, result = self.data_manager.views[self._view_index], self._result
         assert result is not None and self._get_matcher is not None
-        with self.graphs.on_capture_stream():
+        with self.step_runner.on_capture_stream():
             image = result.image
             if view.target.scale.compares_exposures:
                 image = self.field.response.encode_extended(image)
@@ -295,17 +291,17 @@ class Trainer:
         """Return whether the last step came to a multiple of a number of iterations, or past it."""
         return self.iteration % every < self.step_batch
 
-    def check(self, *, wait: bool = True) -> None:
+    def check_skipped_steps(self, *, wait: bool = True) -> None:
         """Raise SehdrError if more than MAX_SKIPPED steps were not finite; the latest ones count if `wait`."""
-        skipped = self.graphs.poll(wait=wait)
+        skipped = self.step_runner.poll(wait=wait)
         if skipped > MAX_SKIPPED:
             raise SehdrError(
                 f"iteration {self.iteration}: {skipped} steps had a loss or gradient that is not finite, "
                 f"more than {MAX_SKIPPED}; lower the learning rates or check photos and cameras"
             )
 
-    def gather(self) -> None:
-        """Gather statistics on rank 0 for a checkpoint; raise SehdrError if the ranks' Gaussians differ."""
+    def sync_ranks(self) -> None:
+        """Sum statistics on rank 0 for a checkpoint; raise SehdrError if the ranks' Gaussians differ."""
         if self.ranks is not None:
             self.ranks.reduce_to_main(list(self.strategy.state_dict(self.field.gaussians.count).values()))
             self.ranks.check_equal(self.field.gaussians.tensors(), self.iteration)
@@ -336,7 +332,7 @@ class Trainer:
         """Return the PSNR of the last step's photo inside the mask, dB; rendering it does not count as training."""
         self.synchronize()
         view = self.data_manager.views[self._view_index]
-        with self.graphs.on_capture_stream():
+        with self.step_runner.on_capture_stream():
             photo = self.field.render_train_view(view.camera, view.exposure_time, degree=self.degree).encoded
         assert photo is not None
         return view.target.psnr(photo)
@@ -344,12 +340,12 @@ class Trainer:
     @property
     def skipped_steps(self) -> int:
         """Number of steps that were skipped because the loss or a gradient was not finite."""
-        return int(self.gradient_step.step_counters[0])
+        return int(self.gradient_step.step_counters[SKIPPED])
 
     @property
     def overflowed_steps(self) -> int:
         """Number of steps that were skipped because a CUDA graph had memory for fewer intersections."""
-        return int(self.gradient_step.step_counters[2])
+        return int(self.gradient_step.step_counters[OVERFLOWED])
 
     @property
     def run(self) -> Run:
@@ -366,15 +362,15 @@ class Trainer:
         """End the training after the current step."""
         self._stopped = True
 
-    def pause(self) -> None:
-        """Keep other ranks waiting for the next step; call it now and then between steps."""
+    def keep_ranks_waiting(self) -> None:
+        """Keep other ranks waiting for the next step; call it again and again during a long pause between steps."""
         if self.ranks is not None and self.ranks.all_reduce_min(WAIT) == END:
             self._ranks_ended = True
             self.stop()
 
     def render(self, camera: Camera) -> RenderedView:
         """Render the scene as it is now in linear Rec.709; does not count as time of the training."""
-        with self.graphs.on_capture_stream():
+        with self.step_runner.on_capture_stream():
             view = self.field.render(camera, degree=self.degree)
         return as_rec709(view, self.scene.color_matrix, self.field)
 

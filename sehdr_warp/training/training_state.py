@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from ..runs.checkpoint import Checkpoint, under
+from .gradient_step import OVERFLOWED, SKIPPED
 from .optimizer import load_optimizer_tensors, optimizer_tensors
 
 if TYPE_CHECKING:
@@ -51,8 +52,8 @@ def load_state(trainer: Trainer, state: Checkpoint) -> None:
         trainer.generator.set_state(generators["device"].cpu())
     trainer.iteration = trainer.first_iteration = values["iteration"]
     trainer.seconds = values["seconds"]
-    trainer.gradient_step.step_counters[0] = values["skipped_steps"]
-    trainer.gradient_step.step_counters[2] = values["overflowed_steps"]
+    trainer.gradient_step.step_counters[SKIPPED] = values["skipped_steps"]
+    trainer.gradient_step.step_counters[OVERFLOWED] = values["overflowed_steps"]
 
 
 class TrainingProgress:

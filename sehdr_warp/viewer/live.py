@@ -128,7 +128,7 @@ class LiveTraining(ViewerScene):
             if self._steps:
                 self._steps -= 1
                 return
-            self.run.pause()
+            self.run.keep_ranks_waiting()
             try:
                 self._make(self._requests.get(timeout=_WAIT))
             except queue.Empty:

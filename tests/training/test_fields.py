@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training.machine import torch_settings
+from sehdr_warp.training.process_settings import torch_settings
 
 from .toy import make_trainer, quick
 

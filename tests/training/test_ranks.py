@@ -198,5 +198,5 @@ def test_a_processor_takes_no_thousands_of_ranks():
 def test_ranks_that_end_during_a_pause_are_not_asked_again():
     trainer, signals = make_trainer(toy_scene(), VARIANTS["default"]), []
     trainer.ranks = SimpleNamespace(all_reduce_min=lambda signal: signals.append(signal) or END)
-    trainer.pause()
+    trainer.keep_ranks_waiting()
     assert trainer.ending and not trainer._agree_to_continue() and signals == [WAIT]

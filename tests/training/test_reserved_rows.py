@@ -15,7 +15,7 @@ from .toy import VARIANTS, make_trainer
 def trained_steps(scene, config, device, reserves):
     """A trainer after 60 steps, and how often its Gaussians moved in how many changes of their number."""
     training = make_trainer(scene, config, device)
-    training.graphs.reserves_rows, gaussians, moves = reserves, training.field.gaussians, []
+    training.step_runner.reserves_rows, gaussians, moves = reserves, training.field.gaussians, []
     for _ in range(60):
         count, before = gaussians.count, gaussians.reallocations
         training.step()

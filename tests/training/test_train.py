@@ -181,7 +181,7 @@ def test_new_gaussians_of_a_large_scene_do_not_fade_before_a_photo_shows_them(sc
     added = gaussians.rows(torch.arange(3, device=device))
     added["means"] = added["means"] + 1e3  # Out of view of all cameras.
     gaussians.append(added, trainer.optimizer)
-    trainer.graphs.invalidate()  # More rows than were reserved, if the scene is large.
+    trainer.step_runner.invalidate()  # More rows than were reserved, if the scene is large.
     before = gaussians.opacities().detach().clone()
     for _ in range(20):
         trainer.step()

@@ -98,7 +98,7 @@ class Steps:
     def __init__(self, count, seconds, picture):
         self.count, self.seconds, self.picture = count, seconds, picture
         self.ending, self.total = False, count
-        self.pause = lambda: None
+        self.keep_ranks_waiting = lambda: None
         self.loss, self.psnr, self.gaussians, self.seconds_left = 0.5, 20.0, 3, None
 
     def __iter__(self):
