@@ -22,7 +22,7 @@ from ..model.renders import CameraTensors
 from ..runs.config import Config
 from ..runs.light_estimates import ClippedLight, light_estimates
 from ..scene import View
-from .losses import compares_exposures
+from .losses import comparing_response
 from .targets import Target, select_view
 from .training_views import TrainingView, ViewDataset, ViewStack
 
@@ -50,8 +50,9 @@ class DataManager:
     @property
     def clipped_light_targets(self) -> list[Tensor] | None:
         """Estimates [h, w, 6] of each view's log light, to which the loss pulls clipped pixels; None if it does not."""
-        estimates = self.light_estimates if compares_exposures(self._config.loss, self._field) else None
-        return None if estimates is None else [estimate.log_light for estimate in estimates]
+        if comparing_response(self._config.loss, self._field) is None or self.light_estimates is None:
+            return None
+        return [estimate.log_light for estimate in self.light_estimates]
 
     def use_code_intervals(self) -> None:
         """Turn bright codes into intervals, if they are not yet."""
@@ -86,7 +87,7 @@ class DataManager:
             field.base_time,
             field.gaussians.means.device,
             clipping=loss.clipping,
-            compare_by=field.response if compares_exposures(loss, field) else None,
+            response=comparing_response(loss, field),
             estimates=self.clipped_light_targets,
             truth=loss.uses_hdr,
         )

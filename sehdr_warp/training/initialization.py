@@ -78,10 +78,10 @@ def make_field(
     get_matcher: Callable[[], Matcher] | None = None,
     time: float | None = None,
 ) -> RadianceField:
-    """Return the field at iteration 0, in the normalized coordinates of the scene.
+    """Return the field at iteration 0: the Gaussians of model.init_file, or one at each of start_points().
 
-    The scene is in its own coordinates, the matcher of its photos in normalized ones. `time` is dt_1, the exposure time
-    that colors refer to, seconds, by default base_time(). Raises InputError for a scene that cannot be trained.
+    The scene is in its own coordinates, field and matcher in normalized ones. `time` is dt_1, the exposure time that
+    colors refer to, seconds, by default base_time(). Raises InputError for a scene that cannot be trained.
     """
     check_views(scene)
     time = time or base_time(scene)

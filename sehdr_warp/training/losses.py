@@ -8,7 +8,7 @@ from ..rasterizer.losses.code_residual import code_residual
 from ..rasterizer.losses.opacity_penalty import opacity_penalty
 from ..rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
 from ..rasterizer.losses.ssim import image_distance, ssim
-from ..response import ToneMapper
+from ..response import Response, ToneMapper
 from ..runs.config import LossConfig
 from .targets import Target, mu_law
 
@@ -80,10 +80,10 @@ def compared_image(render: TrainRender, target: Target) -> Tensor:
     return image
 
 
-def compares_exposures(config: LossConfig, field: RadianceField) -> bool:
-    """Return whether ldr_loss compares exposures: if each pixel has one and the response is known."""
+def comparing_response(config: LossConfig, field: RadianceField) -> Response | None:
+    """Return the known response by which ldr_loss compares exposures; None if it compares encoded values or nothing."""
     decodable = not field.color_model.display_referred and field.tone_map == "pixel" and not field.response.learnable
-    return config.ldr_weight > 0 and decodable
+    return field.response if config.ldr_weight > 0 and decodable else None
 
 
 def anchor_loss(mapper: ToneMapper) -> Tensor:

@@ -59,7 +59,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     samples, ray_points = _sample_points(scene, views, seed)
     visible, on_rays = (_in_view(views, points).sum(0) for points in (samples, ray_points))
     read_views = every_nth(views, MOST_VIEWS)
-    figures = np.array([_codes(view) for view in read_views])
+    figures = np.array([_photo_statistics(view) for view in read_views])
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     longest = 2 * sorted(view.exposure_time for view in photos)[:3][-1]
     dark_views = every_nth([view for view in views if view.exposure_time <= longest], MOST_VIEWS)
@@ -79,7 +79,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         unclipped=scene.light_known and all(view.source and file_kind(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
         pixel_bytes=pixel_bytes(photos),
-        clipped_when_dark=float(np.mean([_codes(view)[0] for view in dark_views])),
+        clipped_when_dark=float(np.mean([_photo_statistics(view)[0] for view in dark_views])),
     )
 
 
@@ -107,7 +107,7 @@ def _in_view(views: Sequence[View], points: np.ndarray) -> np.ndarray:
     return np.array([view.camera.project(points).inside for view in views])
 
 
-def _codes(view: View) -> tuple[float, float, float, float, float]:
+def _photo_statistics(view: View) -> tuple[float, float, float, float, float]:
     """Return statistics of a photo: clipped and black fractions, mean, mean square, and the median's light in stops.
 
     The mean is of encoded values, the light by a gamma of 2.2.

@@ -105,7 +105,7 @@ class ViewDataset(Sequence[TrainingView]):
         *,
         truth: bool,
         clipping: bool = True,
-        compare_by: Response | None = None,
+        response: Response | None = None,
         estimates: list[Tensor] | None = None,
     ):
         """Wrap views.
@@ -116,13 +116,13 @@ class ViewDataset(Sequence[TrainingView]):
             device: Torch device.
             truth: Also upload HDR truth.
             clipping: As in code_scale().
-            compare_by: The response of code_scale(): exposures are compared by it, encoded values without.
+            response: As in code_scale(): exposures are compared by it, encoded values without.
             estimates: For each view those of its Target.
         """
         self.views, self.base_time, self.device = views, base_time, device
         self.truth, self.estimates = truth, estimates
         self._deep = any(view.codes.dtype == np.uint16 for view in views)
-        self.scale = code_scale(65535 if self._deep else 255, compare_by, device, clipping=clipping)
+        self.scale = code_scale(65535 if self._deep else 255, response, device, clipping=clipping)
 
     def __len__(self) -> int:
         """Return the number of views."""

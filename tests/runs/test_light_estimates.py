@@ -49,7 +49,7 @@ def test_nothing_is_estimated_where_nothing_clips_or_exposures_are_not_compared(
 def test_targets_carry_the_estimates():
     views = [replace(view(255, stated=4.0, deviation=0.5), name=name) for name in "ab"]
     estimates = [known.log_light for known in light_estimates(views, SRGB, LossConfig(light_prior=False), CPU)]
-    source = ViewDataset(views, 1.0, CPU, truth=False, compare_by=SRGB, estimates=estimates)
+    source = ViewDataset(views, 1.0, CPU, truth=False, response=SRGB, estimates=estimates)
     assert torch.equal(source[1].target.estimates, estimates[1])
 
 

@@ -61,7 +61,7 @@ def test_a_scale_has_black_at_0_and_white_at_1(device, deep):
     view = toy_scene().views[0]
     view = dataclasses.replace(view, codes=view.codes.astype(np.uint16)) if deep else view
     for light in (None, response_by_name("srgb")):
-        scale = views_of((view,), device, compare_by=light)[0].target.scale
+        scale = views_of((view,), device, response=light)[0].target.scale
         for wide in (False, light is not None and not deep):
             worth, least, most = scale.table.unbind(1)
             assert len(worth) == (65536 if deep else 256)

@@ -13,16 +13,7 @@ from .adc import AdcStrategy
 from .base import SEED_STRIDE, MakeSeeds, Schedule, Seeds, Strategy
 from .mcmc import DENSE, McmcStrategy, mcmc_cap
 
-__all__ = [
-    "SEED_STRIDE",
-    "AdcStrategy",
-    "MakeSeeds",
-    "McmcStrategy",
-    "Seeds",
-    "Strategy",
-    "make_strategy",
-    "mcmc_cap",
-]
+__all__ = ["SEED_STRIDE", "AdcStrategy", "MakeSeeds", "McmcStrategy", "Seeds", "Strategy", "make_strategy", "mcmc_cap"]
 
 
 def make_strategy(
