@@ -131,21 +131,9 @@ def estimate_compensation(
     def fit(matched: MatchedPoints) -> ExposureCompensation:
         return fit_gains(views, others, matched.points, matched.visible, response)
 
-    def no_drift(
-        matcher: Matcher, matched: MatchedPoints, gains: ExposureCompensation | None = None
-    ) -> CompensationEstimate:
-        choice, least = "none", f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
-        reason = "do not contradict the stated times" if times_known else f"differ by less than {least}"
-        unlike = gains is not None and (gains.stops >= MIN_STOPS or gains.corner_loss >= MIN_CORNER_LOSS)
-        if gains is not None and unlike:
-            figures = f"{gains.stops:.2f} stops between photos and {gains.corner_loss:.0%} towards the corners"
-            reason = f"differ by {figures}, and correcting that does not make them alike"
-        reason = f"matched points {reason}{_reach_note(views, matched, response)}"
-        if len(matched) < MIN_POINTS:
-            choice, reason = UNMEASURED, f"{len(matched)} points match between the photos, too few to measure it"
-        elif gains is not None and np.ptp(np.log2(list(gains.gains.values()))[:, 1]) >= DRIFT:
-            choice = UNMEASURED
-        return CompensationEstimate(None, Decision({}, choice, reason, COMPENSATION), matcher)
+    def no_drift(matcher: Matcher, matched: MatchedPoints, gains=None) -> CompensationEstimate:
+        note = _reach_note(views, matched, response)
+        return CompensationEstimate(None, _no_drift_decision(matched, gains, times_known, note), matcher)
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=at_matching_size(views))
@@ -267,3 +255,20 @@ def _decision(compensation: ExposureCompensation, components: Components, times_
     choice = f"taken out of the photos{over if times_known else ''}"
     reason = f"matched points differ by {', '.join(figures)}{note}"
     return Decision({}, choice, reason, COMPENSATION, always_log=True)
+
+
+def _no_drift_decision(
+    matched: MatchedPoints, gains: ExposureCompensation | None, times_known: bool, note: str
+) -> Decision:
+    """Return the line of the plan for photos that stay as they are, with the gains that do not explain them, if any."""
+    choice, least = "none", f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
+    reason = "do not contradict the stated times" if times_known else f"differ by less than {least}"
+    if gains is not None and (gains.stops >= MIN_STOPS or gains.corner_loss >= MIN_CORNER_LOSS):
+        figures = f"{gains.stops:.2f} stops between photos and {gains.corner_loss:.0%} towards the corners"
+        reason = f"differ by {figures}, and correcting that does not make them alike"
+    reason = f"matched points {reason}{note}"
+    if len(matched) < MIN_POINTS:
+        choice, reason = UNMEASURED, f"{len(matched)} points match between the photos, too few to measure it"
+    elif gains is not None and np.ptp(np.log2(list(gains.gains.values()))[:, 1]) >= DRIFT:
+        choice = UNMEASURED
+    return Decision({}, choice, reason, COMPENSATION)
