@@ -292,7 +292,7 @@ class Config(_Table):
         """Iterations of this training between checkpoints."""
         return self.scaled(self.schedule.checkpoint_every)
 
-    def after(self, finished_at: int) -> "Config":
+    def continued_after(self, finished_at: int) -> "Config":
         """Return the config for the steps that follow a training that was finished after `finished_at` iterations.
 
         The scene must not become worse before it becomes better. So Gaussians are no longer relocated or added, the SH

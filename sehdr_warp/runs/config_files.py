@@ -144,18 +144,6 @@ def _as_toml(value: Any) -> str:
     return "".join(letter if 31 < ord(letter) < 127 else code for letter, code in zip(text, escaped, strict=True))
 
 
-def value_of(path: str, text: str):
-    """Parse the text behind the flag of a field; lists are separated by commas.
-
-    Text that cannot be parsed is returned as it is, so that the validation of the config explains what is allowed.
-    """
-    kind: Any = dict(config_fields())[path].annotation
-    value = [item for item in map(str.strip, text.split(",")) if item] if get_origin(kind) is tuple else text
-    with suppress(ValidationError):
-        return TypeAdapter(kind).validate_python(value)
-    return value
-
-
 def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping[str, str] | None = None) -> Config:
     """Validate nested values, as Config.model_dump() returns them and JSON stores them.
 
@@ -257,7 +245,7 @@ def flags_type() -> type:
         text = lambda words: words[0], lambda value: isinstance(value, str), lambda value: [value]
         spec = PrimitiveConstructorSpec(1, _metavar(item.annotation), *text)
         argument = tyro.conf.arg(
-            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {flag_text(item.default)})"
+            help=" ".join((item.description or "").split()), help_behavior_hint=f"(default: {field_text(item.default)})"
         )
         tables.setdefault(path.rpartition(".")[0], {})[path] = Annotated[str, spec, argument]
     parts = {
@@ -268,15 +256,27 @@ def flags_type() -> type:
     return TypedDict("Fields", {**tables.get("", {}), **parts}, total=False)  # type: ignore[misc]
 
 
-def named_fields(values: dict) -> dict[str, str]:
-    """Return the dotted names and texts in a parsed flags_type()."""
+def used_fields(values: dict) -> dict[str, str]:
+    """Return the fields whose flags were used, with the text behind the flag, of a parsed flags_type()."""
     fields: dict[str, str] = {}
     for name, value in values.items():
-        fields |= named_fields(value) if isinstance(value, dict) else {name: value}
+        fields |= used_fields(value) if isinstance(value, dict) else {name: value}
     return fields
 
 
-def flag_text(value) -> str:
+def parse_field(path: str, text: str):
+    """Parse the text behind the flag of a field; lists are separated by commas.
+
+    Text that cannot be parsed is returned as it is, so that the validation of the config explains what is allowed.
+    """
+    kind: Any = dict(config_fields())[path].annotation
+    value = [item for item in map(str.strip, text.split(",")) if item] if get_origin(kind) is tuple else text
+    with suppress(ValidationError):
+        return TypeAdapter(kind).validate_python(value)
+    return value
+
+
+def field_text(value) -> str:
     """Return a field's value as its flag takes it."""
     if isinstance(value, tuple):
         value = ",".join(map(str, value))

@@ -236,7 +236,7 @@ class Run(RenderableScene):
         self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
         field.photo_focals = photo_focals(self.cameras)
         self.iterations: int = values["iteration"]
-        self.degree = config.after(folder.finished_at()).degree_at(self.iterations)
+        self.degree = config.continued_after(folder.finished_at()).degree_at(self.iterations)
         self.train_seconds: float = values["seconds"]
         self.checkpoint_hash: str = values["sha256"]
         self.data: LoadArguments = info["data"]

@@ -6,7 +6,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..runs.config_files import config_fields, flag_text
+from ..runs.config_files import config_fields, field_text
 from ..runs.run import Run
 from ..runs.scene_description import FOUND
 from ..runs.values import SCENE_OPTIONS, LoadArguments
@@ -186,7 +186,7 @@ def options_of_run(run: Run) -> dict[str, str]:
     for name, item in config_fields():
         value = attrgetter(name)(run.config)
         if value != item.default and name not in planned and name != "plan.keep":
-            options[name] = flag_text(value)
+            options[name] = field_text(value)
     return options
 
 

@@ -104,7 +104,7 @@ class Train:
     training: TrainingOptions = TrainingOptions()
     output: OutputOptions = OutputOptions()
     machine: MachineOptions = MachineOptions()
-    # Text of each config field whose flag was used: {table: {path: text}}, see configs.named_fields().
+    # Text of each config field whose flag was used: {table: {path: text}}, see configs.used_fields().
     fields: Annotated[configs.flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
 
 
@@ -235,7 +235,7 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
             # Iterating the trainer trains; serve_training() answers browsers between its steps.
             run_with_progress(steps, trainer.total)
     options = {"response": args.scene.response, "preset": args.training.preset, "seed": args.training.seed}
-    repeated = options_of_run(trainer.run) if output.resume else configs.named_fields(args.fields) | options
+    repeated = options_of_run(trainer.run) if output.resume else configs.used_fields(args.fields) | options
     repeated |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
     _print_result(args, trainer.run, advice_on(trainer, data, repeated))
 
@@ -341,8 +341,8 @@ def _config(args: Train, saved: "Config | None") -> "Config":
     shortcuts = {"response.name": args.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}
     overrides = {path: value for path, value in shortcuts.items() if value is not None}
     flags = {"response.name": "--response", "schedule.iterations": "--iterations", "seed": "--seed"}
-    for path, text in configs.named_fields(args.fields).items():
-        overrides[path], flags[path] = configs.value_of(path, text), configs.flag_of(path)
+    for path, text in configs.used_fields(args.fields).items():
+        overrides[path], flags[path] = configs.parse_field(path, text), configs.flag_of(path)
     if saved is not None and options.preset is None:
         return configs.override_config(saved, overrides, flags=flags)
     config = configs.load_config(options.preset or "default", overrides, flags)

@@ -195,7 +195,7 @@ def _resumed_trainer(
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     large_scene = checkpoint.values.get("large_scene")
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
-    longer = saved.after(finished_at)
+    longer = saved.continued_after(finished_at)
     trainer = Trainer(scene, longer, field, ranks=ranks, large_scene=large_scene)
     try:
         load_state(trainer, checkpoint)

@@ -18,8 +18,8 @@ from sehdr_warp.runs.config_files import (
     config_from_dict,
     load_config,
     override_config,
+    parse_field,
     preset_names,
-    value_of,
 )
 from sehdr_warp.training.optimizer import means_rate
 
@@ -174,7 +174,7 @@ def test_a_gone_field_of_version_0_2_is_named(tmp_path):
     ],
 )
 def test_values_of_flags(path, text, value):
-    assert value_of(path, text) == value
+    assert parse_field(path, text) == value
 
 
 def test_no_field_is_both_here_and_gone():
@@ -220,15 +220,15 @@ def test_iteration_numbers_scale():
 
 def test_a_finished_training_goes_on_with_its_harmonics_and_positions_that_learn_slowly():
     finished, longer = load_config("default"), load_config("default", {"schedule.iterations": 90_000})
-    after = longer.after(30_000)
+    after = longer.continued_after(30_000)
     assert after.scaled(after.densification.refine_stop_iter) <= 30_000 and after.degree_at(30_001) == 3
     rates = finished.optimizer
     assert means_rate(after, 30_000) == pytest.approx(10 * rates.means_final)
     assert means_rate(after, 90_000) == pytest.approx(rates.means_final)
     twice = load_config("default", {"schedule.iterations": 60_000})
-    assert means_rate(twice.after(30_000), 30_001) == pytest.approx(means_rate(twice, 30_001))
-    assert longer.after(0) == longer and longer.after(90_000) == longer
-    assert longer.after(29_000) == longer  # After a trial, densification begins again.
+    assert means_rate(twice.continued_after(30_000), 30_001) == pytest.approx(means_rate(twice, 30_001))
+    assert longer.continued_after(0) == longer and longer.continued_after(90_000) == longer
+    assert longer.continued_after(29_000) == longer  # After a trial, densification begins again.
 
 
 def test_a_field_cannot_be_set_and_the_error_says_what_to_do():

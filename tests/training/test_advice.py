@@ -2,7 +2,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-from sehdr_warp.runs.config_files import load_config, value_of
+from sehdr_warp.runs.config_files import load_config, parse_field
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene.pose_conventions import MISFIT
 from sehdr_warp.training.advice import advice, advice_on, option_words, options_of_run
@@ -79,7 +79,7 @@ def test_a_resumed_training_is_repeated_with_the_fields_of_its_run(tmp_path):
     run = train(toy_scene(), tmp_path / "run", device="cpu", resume=True)
     options = options_of_run(run)
     assert "--plan.keep" not in option_words(options) and "--schedule.iterations" not in option_words(options)
-    again = load_config("default", {name: value_of(name, text) for name, text in options.items()})
+    again = load_config("default", {name: parse_field(name, text) for name, text in options.items()})
     assert (again.seed, again.loss.ssim_weight) == (7, 0.3)
     assert again.densification.strategy == run.config.densification.strategy == "adc", "the preset's fields are stated"
     config = load_config("default", {"schedule.iterations": 2, "plan.keep": ("schedule.iterations",)})
