@@ -18,7 +18,7 @@ from torch import Tensor
 from ..model.gaussians import Gaussians
 from ..model.paged_field import boxes_in_view
 from ..runs.config_files import override_config
-from ..runs.run import assemble_field
+from ..runs.field import assemble_field
 from ..runs.run_folder import RunFolder
 from ..scene import Camera, Scene
 from ..training.initialization import response_for_training

@@ -13,9 +13,6 @@ from ..errors import InputError, SehdrError
 from ..model.baking import field_of
 from ..model.color_models import rec709_of
 from ..model.confidence import Evidence, gather_evidence
-from ..model.exposure import exposure_times
-from ..model.fusion import NeuralExposureFusion
-from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.lights import Light, find_lights
 from ..model.paged_field import PagedField
 from ..model.pixel_filter import FocalRange, samples_across_pixel
@@ -25,11 +22,11 @@ from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.gravity import UpDirection
-from ..scene.normalization import Normalization
 from ..splats import cameras_beside, read_gaussians
-from .checkpoint import PICTURE, Checkpoint, under
+from .checkpoint import PICTURE
 from .config import Config
 from .device import pick_device
+from .field import field_from_checkpoint
 from .light_estimates import light_estimates
 from .run_folder import CameraEntry, RunFolder
 from .run_writer import write_confidence
@@ -234,7 +231,7 @@ class Run(RenderableScene):
         self.response: Response = field.response
         self.base_time = field.base_time
         self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
-        field.photo_focals = photo_focals(self.cameras)
+        field.photo_focals = FocalRange.of(entry.camera for entry in self.cameras if entry.split == "train")
         self.iterations: int = values["iteration"]
         self.degree = config.continued_after(folder.finished_at()).degree_at(self.iterations)
         self.train_seconds: float = values["seconds"]
@@ -316,11 +313,6 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     return Run(folder, config, on_device(field, pick_device(device)), info, checkpoint.values, clipped)
 
 
-def photo_focals(cameras: tuple[CameraEntry, ...]) -> FocalRange | None:
-    """Return the focal lengths of the training photos; None without any."""
-    return FocalRange.of(entry.camera for entry in cameras if entry.split == "train")
-
-
 def on_device(field: RadianceField, device: torch.device, budget: int | None = None) -> RadianceField:
     """Return a field on a device; if its Gaussians are too many for a GPU, one that copies those that are in view.
 
@@ -344,49 +336,6 @@ def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, field: Radiance
 def exposure_compensation(info: dict) -> ExposureCompensation | None:
     """Return the exposure compensation that run.json contains, if any."""
     return ExposureCompensation.from_dict(fields) if (fields := info.get("exposure_compensation")) else None
-
-
-def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) -> RadianceField:
-    """Return the RadianceField of a checkpoint, on the CPU; raises InputError if tensors are missing or do not fit."""
-    try:
-        gaussians = Gaussians(*(checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETER_NAMES))
-        normalization = Normalization.from_dict(info["normalization"])
-        response = Response.from_dict(info["response"])
-        field = assemble_field(gaussians, config, response, info["base_time"], normalization)
-        learned = field.response if isinstance(field.response, torch.nn.Module) else None
-        for name, part in (("fusion.", field.fusion), ("response.", learned)):
-            if part is not None:
-                part.load_state_dict(under(checkpoint.tensors, name))
-    except (KeyError, ValueError, RuntimeError) as error:
-        problem = f"its tensors do not fit the config ({error})"
-        raise InputError(checkpoint.path, problem, "the run is damaged: train again") from None
-    return field
-
-
-def assemble_field(
-    gaussians: Gaussians,
-    config: Config,
-    response: Response,
-    base_time: float,
-    normalization: Normalization | None = None,
-) -> RadianceField:
-    """Return a field of Gaussians, a response and a freshly seeded fusion as the config says."""
-    fusion, options = None, config.fusion
-    if options.enabled:
-        scale = 1.0 / base_time if options.radiance_scale == "base" else 1.0
-        times = exposure_times(base_time, options.exposures)
-        fusion = NeuralExposureFusion(response, times, base_time, radiance_scale=scale, seed=config.seed)
-    return RadianceField(
-        gaussians,
-        response,
-        base_time=base_time,
-        color_model=config.model.radiance,
-        tone_map=config.model.tone_map,
-        fusion=fusion,
-        antialiased=config.model.antialiased,
-        deterministic=config.deterministic,
-        normalization=normalization,
-    )
 
 
 def ensure_confidence(run: Run, scene: Scene) -> None:

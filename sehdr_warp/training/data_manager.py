@@ -200,12 +200,12 @@ class PhotoStream:
             torch.cuda.current_stream(self._device).wait_event(self._filled[slot])
         self._slot_index.fill_(slot)
 
-    def release(self, following: int | None) -> None:
-        """Mark the view of bring() as read by launched kernels, and start to fetch the one that follows."""
+    def release(self, next_index: int | None) -> None:
+        """Mark the view of bring() as read by launched kernels, and start to fetch the next one."""
         if self._cuda:
             self._free[self._current].record(torch.cuda.current_stream(self._device))
-        if following is not None:
-            self._fetch(following)
+        if next_index is not None:
+            self._fetch(next_index)
 
     def _fetch(self, index: int) -> None:
         """Start to fill a slot with a view unless one holds it."""

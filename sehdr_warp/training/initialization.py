@@ -16,7 +16,7 @@ from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name
 from ..runs.config import Config
-from ..runs.run import assemble_field
+from ..runs.field import assemble_field
 from ..scene import Scene, View
 from ..scene.normalization import Normalization, normalization_of
 from ..scene.response_choice import select_for_views

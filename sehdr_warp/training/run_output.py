@@ -63,14 +63,14 @@ class RunOutput:
         iteration = trainer.iteration
         evaluate = not self._evaluate_at.isdisjoint(range(iteration - trainer.step_batch + 1, iteration + 1))
         evaluate &= iteration < trainer.total
-        save = trainer.came_to(trainer.config.checkpoint_interval)
+        save = trainer.passed_multiple_of(trainer.config.checkpoint_interval)
         if evaluate or save:
             trainer.synchronize()
         if evaluate:
             self.evaluate(trainer)
         if save and iteration < trainer.total and time.monotonic() - self._saved_at >= self._least_seconds:
             self.checkpoint(trainer)
-        if self._tensorboard and trainer.came_to(self._log_every):
+        if self._tensorboard and trainer.passed_multiple_of(self._log_every):
             figures = {"loss": trainer.loss, "psnr": trainer.psnr()}
             self._log(trainer, "train", figures | {"gaussians": trainer.field.gaussians.count})
 

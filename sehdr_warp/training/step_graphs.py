@@ -49,9 +49,9 @@ class StepRunner:
         self._eager_keys: set[GraphKey] = set()
 
     def run(
-        self, views: DeviceViews, index: int, following: int | None, options: StepOptions, iteration: int
+        self, views: DeviceViews, index: int, next_index: int | None, options: StepOptions, iteration: int
     ) -> StepResult:
-        """Do GradientStep.run() on view `index`; if photos are streamed, fetch view `following` at the same time."""
+        """Do GradientStep.run() on view `index`; if photos are streamed, fetch view `next_index` at the same time."""
         step, gaussians = self._step, self._step.field.gaussians
         # Not if Gaussians.surround() has, for those that are rendered but not trained.
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
@@ -59,7 +59,7 @@ class StepRunner:
         step.prepare(options, iteration)
         key = step.graph_key(views, options)
         if self.can_replay(views, key) and (capacity := self._capacity.next()) is not None:
-            return self._replay(views, index, following, options, key, capacity, iteration)
+            return self._replay(views, index, next_index, options, key, capacity, iteration)
         with self.on_capture_stream():  # Without a capacity, so that result.intersections is their number.
             result = step.run(views[index], options)
         self._capacity.observe(result.intersections)
@@ -82,7 +82,7 @@ class StepRunner:
         self,
         views: ViewStack | PhotoStream,
         index: int,
-        following: int | None,
+        next_index: int | None,
         options: StepOptions,
         key: GraphKey | None,
         capacity: int,
@@ -112,7 +112,7 @@ class StepRunner:
                 f"({str(error).splitlines()[0]}); train with --schedule.use-cuda-graph=false, which is slower"
             ) from error
         if isinstance(views, PhotoStream):
-            views.release(following)
+            views.release(next_index)
         return result
 
     def adapt(self, count: int, reallocations: int, iteration: int) -> None:

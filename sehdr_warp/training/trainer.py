@@ -237,8 +237,8 @@ class Trainer:
         options = StepOptions(self.degree, opacity_weight, self.strategy.needs_gradients(self.iteration))
 
         # Forward, loss, backward, optimizer step: GradientStep.run().
-        views, following = self.data_manager.views, self.sampler.peek()
-        self._result = self.step_runner.run(views, self._view_index, following, options, self.iteration)
+        views, next_index = self.data_manager.views, self.sampler.peek()
+        self._result = self.step_runner.run(views, self._view_index, next_index, options, self.iteration)
         # Densification.
         self.strategy.inject_noise(self.iteration, self.field.gaussians, means_lr)
         if self.strategy.is_due(self.iteration, self.step_batch):
@@ -248,9 +248,9 @@ class Trainer:
         # Moving average; after the last step, it replaces the Gaussians.
         self.average.update(self.iteration, self.step_batch, self.field.gaussians)
         # Checks; a checkpoint after this step holds what the ranks sum here.
-        if self.came_to(CHECK_EVERY):
+        if self.passed_multiple_of(CHECK_EVERY):
             self.check_skipped_steps(wait=False)
-        if self.came_to(COMPARE_EVERY) or self.came_to(self.config.checkpoint_interval):
+        if self.passed_multiple_of(COMPARE_EVERY) or self.passed_multiple_of(self.config.checkpoint_interval):
             self.sync_ranks()
 
     def _densify(self) -> None:
@@ -287,7 +287,7 @@ class Trainer:
 
     # Between steps
 
-    def came_to(self, every: int) -> bool:
+    def passed_multiple_of(self, every: int) -> bool:
         """Return whether the last step came to a multiple of a number of iterations, or past it."""
         return self.iteration % every < self.step_batch
 

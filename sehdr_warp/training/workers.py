@@ -9,8 +9,9 @@ import torch
 from ..errors import InputError
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
+from ..runs.field import field_from_checkpoint
 from ..runs.open import PhotoRequest, in_world_of_run
-from ..runs.run import exposure_compensation, field_from_checkpoint
+from ..runs.run import exposure_compensation
 from ..runs.scene_description import FOUND, describe_scene, scene_difference
 from ..scene import Camera, Scene
 from ..scene.normalization import Normalization

@@ -16,7 +16,8 @@ from sehdr_warp.output.lighting.unit import read_light_unit
 from sehdr_warp.output.world_transform import read_orientation
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.runs.run import assemble_field, load_run
+from sehdr_warp.runs.field import assemble_field
+from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter, write_confidence
 from sehdr_warp.runs.values import FORMAT

@@ -17,7 +17,7 @@ from sehdr_warp.prior import LightPrior
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.runs.run import assemble_field
+from sehdr_warp.runs.field import assemble_field
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.normalization import normalization_of
 from sehdr_warp.splats import write_gaussians

@@ -13,7 +13,8 @@ import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.runs.config_files import load_config, override_config
-from sehdr_warp.runs.run import field_from_checkpoint, load_run
+from sehdr_warp.runs.field import field_from_checkpoint
+from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
 from sehdr_warp.scene import response_choice
