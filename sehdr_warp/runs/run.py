@@ -306,8 +306,7 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     checkpoint = folder.newest_checkpoint(PICTURE)
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
-    field = field_from_checkpoint(checkpoint, config, info).requires_grad_(False)
-    clipped = None
+    field, clipped = field_from_checkpoint(checkpoint, config, info).requires_grad_(False), None
     if (evidence := folder.read_evidence(checkpoint)) is not None:
         field.confidence, clipped, field.clipped_stops = evidence.confidence(), evidence.clipped, evidence.clipped_stops
     return Run(folder, config, on_device(field, pick_device(device)), info, checkpoint.values, clipped)

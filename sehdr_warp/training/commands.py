@@ -218,17 +218,8 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
     with nullcontext() if device.type != "cpu" else precompiling(config):
         if ranks is not None and ranks.info.several_nodes:
             ranks.request_photos(request)
-        trainer = create_trainer(
-            request.load(),
-            out,
-            config,
-            device=device,
-            resume=output.resume,
-            overwrite=output.overwrite,
-            tensorboard=output.tensorboard,
-            data=data,
-            ranks=ranks,
-        )
+        flags = {name: getattr(output, name) for name in ("resume", "overwrite", "tensorboard")}
+        trainer = create_trainer(request.load(), out, config, device=device, data=data, ranks=ranks, **flags)
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
         with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
