@@ -100,8 +100,8 @@ def _browsed(run: sw.Run, photo_view: sw.View, scene: sw.Scene) -> Image.Image:
     """The page of `view`, two and a half stops down beside the photo, with the pointer on the brightest light."""
     from playwright.sync_api import sync_playwright
 
-    from sehdr_warp.viewer.frames import ViewerScene
     from sehdr_warp.viewer.server import Server, Viewer
+    from sehdr_warp.viewer.viewer_scene import ViewerScene
 
     photos = {view.name: view for view in scene.views}
     viewer = Viewer([ViewerScene(run, run.scene_name)], lambda _: photos)

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from .connections import Connection
-from .frames import ViewerScene
+from .viewer_scene import ViewerScene
 
 
 class Refusal(Exception):

@@ -15,8 +15,8 @@ import torch
 from ..errors import SehdrError
 from ..progress import format_seconds
 from ..scene import Camera
-from .frames import ViewerScene
 from .server import Server, Viewer
+from .viewer_scene import ViewerScene
 
 log = logging.getLogger(__name__)
 

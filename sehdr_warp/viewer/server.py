@@ -31,8 +31,8 @@ from ..output.scene_page import write_scene_page
 from .clients import ClientRun, Refusal, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, orient
-from .frames import ViewerScene, camera_file, camera_of, frame_bytes
 from .renderer import Renderer
+from .viewer_scene import ViewerScene, camera_file, camera_of, frame_bytes
 
 log = logging.getLogger(__name__)
 PORTS_TRIED = 50

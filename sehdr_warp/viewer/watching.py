@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SehdrError
-from .frames import ViewerScene
+from .viewer_scene import ViewerScene
 
 log = logging.getLogger(__name__)
 PATIENCE = 2.0  # Seconds between looks

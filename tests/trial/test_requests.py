@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Server, Viewer
+from sehdr_warp.viewer.viewer_scene import ViewerScene
 
 from .harness import files_in
 

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Server, Viewer
+from sehdr_warp.viewer.viewer_scene import ViewerScene
 
 from ..output.helpers import AnalyticRun
 from ..output.report.test_write import make

@@ -10,8 +10,8 @@ import pytest
 from sehdr_warp import load_run
 from sehdr_warp.viewer import connections
 from sehdr_warp.viewer.clients import ClientRun
-from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import MOST_SAVED, Server
+from sehdr_warp.viewer.viewer_scene import ViewerScene
 
 from ..output.helpers import AnalyticRun, camera
 from .test_server import ask, frame

@@ -14,8 +14,8 @@ from sehdr_warp.output.export.splat_edits import SplatEdits
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.scene import Camera, View
 from sehdr_warp.scene.normalization import Normalization
-from sehdr_warp.viewer.frames import ViewerScene
 from sehdr_warp.viewer.server import Viewer
+from sehdr_warp.viewer.viewer_scene import ViewerScene
 
 from ..output.export.test_splat_edits import run_of, splats
 from .browser import browser, page_of

@@ -48,8 +48,8 @@ class GradientLayout:
     It begins with a row for each Gaussian, which the blend adds to: features, conic, x, y, opacity, and columns that
     pad the row. Then come a copy of the features' gradient and the gradients of the projection's inputs.
 
-    gaussians: inputs of the projection, None where no gradient is needed; empty if the CUDA graph begins with 2D
-    Gaussians. copies_features: add a contiguous gradient of features, which torch can use as a leaf's without a copy.
+    gaussians: inputs of the projection, None where no gradient is needed; none if the graph begins with 2D Gaussians.
+    copies_features: add a contiguous gradient of features, which torch can use as a leaf's without a copy.
     like: a tensor of the shape of all of it that takes no memory, for torch.empty_like().
     """
 

@@ -37,7 +37,7 @@ class PackedLaunch:
         """Compile or load the kernel. dim and values are of the first launch."""
         self.kernel, self.arguments = kernel.key, kernel.adj.args
         self.kinds = [argument.type for argument in self.arguments] * (1 + adjoint)
-        self.packed: list[Any] = [...] * len(self.kinds)  # The last launch's values, and of tensors the layouts.
+        self.packed: list[Any] = [...] * len(self.kinds)  # What the last launch packed: values, and layouts of tensors
         count = len(self.arguments)
         initial = [
             type(kind.__ctype__())() if hasattr(kind, "__ctype__") else values[index % count]

@@ -1,4 +1,4 @@
-"""Answers of a run to the page: float frames of a camera, and the facts that it draws with."""
+"""A scene as the viewer shows it: its edits and gains, float frames of a camera, and what the page knows of it."""
 
 import json
 import shlex
