@@ -21,7 +21,7 @@ from ..runs.run import Splats
 from ..scene import Camera
 from ..splats.arrays import HARMONIC_0
 from .cameras.opening import camera_facts, opening_facts
-from .cameras.scene_cameras import training_cameras
+from .cameras.scene_cameras import split_or_all
 from .export.splat_edits import SplatEdits, most_visible, without_strays
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
 from .images.tonemap import display_gain
@@ -56,7 +56,7 @@ def write_scene_page(
     path = Path(path)
     check_absent(path, overwrite)
     opening = opening_facts(run)
-    cameras = training_cameras(run) or [e.camera for e in run.cameras]
+    cameras = split_or_all(run, "train")
     places = [camera.position for camera in cameras or [Camera.from_dict(opening["opening"])]]
     gaussians = gaussians_of(run.field, "linear", np.array(places), color_matrix=run.color_matrix)
     transform = world_transform(run)

@@ -26,7 +26,7 @@ from ..scene import Camera
 from ..scene.gravity import is_pitch_known, typical_roll, up_direction
 from ..splats import STREAMED_SOG
 from ..splats.arrays import LARGEST_SCALE, similarity
-from .cameras.scene_cameras import common_focus, middle_index, training_cameras
+from .cameras.scene_cameras import common_focus, middle_index, split_or_all, training_cameras
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -129,7 +129,7 @@ def world_transform(
     by_gps = None if run.up is None else run.up.unit
     factor = _checked_scale(next((each for each in (scale, orientation.scale, by_gps) if each is not None), None))
     direction = _known_up(run, up, orientation)
-    cameras = training_cameras(run) or [e.camera for e in run.cameras]
+    cameras = split_or_all(run, "train")
     if direction is None and (run.world_matrix is not None or not cameras):
         # Turned about the axis of view, so that what is ahead stays ahead.
         rotation = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) else np.eye(3)

@@ -23,7 +23,7 @@ from .framing import (
     widescreen_camera,
 )
 from .paths import look_at_pose, moved, walk
-from .scene_cameras import camera_axes, camera_positions, common_focus, middle_index, surround, training_cameras
+from .scene_cameras import camera_axes, camera_positions, common_focus, middle_index, split_or_all, surround
 
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene
@@ -48,7 +48,7 @@ def opening_view(run: "RenderableScene") -> Camera | None:
     several photos that is taken whose picture shows most of what at least three photos show. A walk ahead is opened at
     its start. Gaussians without cameras are looked at from outside.
     """
-    photos = training_cameras(run) or [entry.camera for entry in run.cameras]
+    photos = split_or_all(run, "train")
     if not photos:
         return _view_from_outside(run)
     photos = [camera for camera in photos if camera.is_pinhole]

@@ -25,6 +25,11 @@ def training_cameras(run: "RenderableScene") -> list[Camera]:
     return [entry.camera for entry in run.cameras if entry.split == "train"]
 
 
+def split_or_all(run: "RenderableScene", split: str) -> list[Camera]:
+    """Return the cameras of a split, train or test, or all cameras of a scene without any of it."""
+    return [entry.camera for entry in run.cameras if entry.split == split] or [entry.camera for entry in run.cameras]
+
+
 def camera_named(run: "RenderableScene", name: str) -> Camera:
     """Return the camera of a view; raise SehdrError if the scene has none of this name."""
     cameras = {entry.name: entry.camera for entry in run.cameras}

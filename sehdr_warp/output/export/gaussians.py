@@ -15,7 +15,6 @@ from ...files import atomic_path
 from ...model.baking import agreement, field_of, gaussians_of, refine, with_photo_filters
 from ...response import response_by_name
 from ...runs.run import on_device
-from ...scene import Camera
 from ...scene.exposure.times import shutter
 from ...splats import (
     STREAMED_SOG,
@@ -30,7 +29,7 @@ from ...splats import (
 )
 from ...subsets import every_nth, first_names
 from ..brackets import remove_earlier
-from ..cameras.scene_cameras import camera_positions, training_cameras
+from ..cameras.scene_cameras import camera_positions, split_or_all, training_cameras
 from ..images.tonemap import display_gain
 from ..world_transform import WorldTransform, file_transform, is_y_down, photos_to_file, world_transform
 from .splat_edits import SplatEdits, most_visible, without_strays
@@ -191,7 +190,7 @@ def loss_in_words(decibels: float) -> str:
 
 def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, display_time: float, note: str) -> None:
     """Measure and log how well Gaussians in the scene's coordinates show it; `note` follows the number of views."""
-    views = _cameras_to_compare(run)
+    views = every_nth(split_or_all(run, "test"), _MAX_COMPARED)
     where = f"{len(views)} view{'s' * (len(views) != 1)}{note}"
     if not views:
         log.info("not compared with the scene, because the file has no cameras")
@@ -212,7 +211,7 @@ def _log_file_loss(
     path: Path, run: "RenderableScene", part: GaussianArrays | None, to_file: WorldTransform, display_time: float
 ) -> None:
     """Measure and log what a compressed file loses, read back, beside the part that was exported or the scene."""
-    views = _cameras_to_compare(run)
+    views = every_nth(split_or_all(run, "test"), _MAX_COMPARED)
     if not views:
         return
     # SPZ does not state the exposure time.
@@ -225,12 +224,6 @@ def _log_file_loss(
     files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
     size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
     log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, name, loss_in_words(decibels), size)
-
-
-def _cameras_to_compare(run: "RenderableScene") -> Sequence[Camera]:
-    held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
-    views = held_out or [entry.camera for entry in run.cameras]
-    return every_nth(views, _MAX_COMPARED)
 
 
 def _photo_renderer(run: "RenderableScene", time: float) -> Callable:

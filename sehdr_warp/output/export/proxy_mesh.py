@@ -20,7 +20,7 @@ from ...progress import track_progress
 from ...scene import Camera
 from ...splats.usd import pxr, writing_usd
 from ...subsets import evenly
-from ..cameras.scene_cameras import training_cameras
+from ..cameras.scene_cameras import split_or_all, training_cameras
 from ..images.tonemap import encode_srgb
 from ..world_transform import WorldTransform, scene_up, world_transform
 from .depth_fusion import (
@@ -292,8 +292,7 @@ def mesh_depth(mesh: ProxyMesh, camera: Camera) -> np.ndarray:
 
 def _log_agreement(mesh: ProxyMesh, run: "RenderableScene", transform: WorldTransform) -> None:
     """Compare the depth of mesh and scene in a few held-out views, and log it."""
-    held_out = [entry.camera for entry in run.cameras if entry.split == "test"]
-    cameras = evenly(held_out or [entry.camera for entry in run.cameras], _CHECKED)
+    cameras = evenly(split_or_all(run, "test"), _CHECKED)
     low, high = mesh.vertices.min(0) - mesh.voxel, mesh.vertices.max(0) + mesh.voxel
     differences, total = [np.zeros(0)], 0
     for view in (view for camera in cameras for view in depth_views(run, camera, transform, 120)):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from ...scene import Camera
 from ...subsets import evenly
-from ..cameras.scene_cameras import camera_positions, training_cameras
+from ..cameras.scene_cameras import camera_positions, split_or_all
 from ..html import EMPTY, join, markup
 from ..images.ldr_files import as_array, quantize
 from .charts import PANELS, training_points
@@ -73,7 +73,7 @@ def camera_map(run: "RenderableScene", tone_map: Any, names: Sequence[str] = ())
     east /= max(float(np.linalg.norm(east)), 1e-9)
     plane = np.stack([east, np.cross(up, east)])  # Away from the first camera is up on the page.
     positions = camera_positions(cameras) @ plane.T
-    points, colors = _visible_points(training_cameras(run) or cameras, run, up)
+    points, colors = _visible_points(split_or_all(run, "train"), run, up)
     ground = points @ plane.T
     spread = np.concatenate([positions, np.percentile(ground, (2, 98), axis=0)] if len(ground) else [positions])
     low, high = spread.min(axis=0), spread.max(axis=0)
