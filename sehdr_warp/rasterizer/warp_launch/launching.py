@@ -54,7 +54,7 @@ def launch(
     """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
-    device, values = _all_values(kernel, arguments, gradients)
+    device, values = _device_and_values(kernel, arguments, gradients)
     packed = _packed_launch(kernel, device, block_dim, gradients is not None, dim, values)
     if device.type == "cpu" and isinstance(dim, int) and takes_range_start(kernel):
         packed.launch_ranges(threads.even_ranges(dim, min_range) if ranges is None else ranges, values)
@@ -62,7 +62,7 @@ def launch(
         packed.launch(dim, values, warp_stream(device))
 
 
-def _all_values(
+def _device_and_values(
     kernel: Any, arguments: Sequence[Any], gradients: Sequence[Tensor | None] | None
 ) -> tuple[torch.device, list]:
     """Return the device, and the arguments with 0 for `range_start`, for an adjoint followed by their gradients."""
@@ -88,7 +88,7 @@ def fixed_launch(
     strided: tensors among arguments and gradients that each launch gives anew, with any distance from row to row.
     by_address: those whose addresses each launch gives; their layout stays. The others are launch()'s.
     """
-    device, values = _all_values(kernel, arguments, gradients)
+    device, values = _device_and_values(kernel, arguments, gradients)
     packed = PackedLaunch(kernel, device, block_dim, gradients is not None, dim, values)
     return FixedLaunch(packed, dim, values, strided, by_address)
 
