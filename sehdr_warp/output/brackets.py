@@ -165,7 +165,7 @@ class BracketWriter:
         ldr: One of LDR_FORMATS to add simulated photos through response.encode, or None.
         response: Camera response for ldr.
         group_by: "view" or "exposure": what one folder holds. Folders by exposure hold image sequences.
-        views: Entries of the manifest so far.
+        manifest_views: Entries of brackets.json so far.
     """
 
     out: Path
@@ -176,7 +176,7 @@ class BracketWriter:
     ldr: str | None = None
     response: Any = None
     group_by: str = "view"
-    views: list[dict] = field(default_factory=list)
+    manifest_views: list[dict] = field(default_factory=list)
 
     def __post_init__(self):
         """Raise SehdrError for options that contradict each other."""
@@ -212,13 +212,13 @@ class BracketWriter:
                 "response": getattr(self.response, "name", None),
                 "ldr": self.ldr,
                 "provenance": dict(self.header.provenance),
-                "views": self.views,
+                "views": self.manifest_views,
             }
             write_json(manifest, described)
 
     def files(self) -> list[Path]:
         """Return the paths of the EXR files and of the photos beside them."""
-        entries = [entry for view in self.views for entry in view["exposures"]]
+        entries = [entry for view in self.manifest_views for entry in view["exposures"]]
         names = dict.fromkeys(entry[kind] for kind in ("file", "ldr_file") for entry in entries if kind in entry)
         return [self.out / name for name in names]
 
@@ -261,4 +261,4 @@ class BracketWriter:
             entries.append(entry)
         if self.multipart:
             write_multipart_exr(self._folder / f"{name}.exr", parts, pixel=pixel)
-        self.views.append({"view": name, "pixel": pixel, "exposures": entries})
+        self.manifest_views.append({"view": name, "pixel": pixel, "exposures": entries})
