@@ -12,7 +12,8 @@ import pytest
 
 from sehdr_warp import __version__, cli
 from sehdr_warp.response import response_names
-from sehdr_warp.runs.config_files import config_fields, flag_of, load_config, preset_names
+from sehdr_warp.runs.config_files import config_fields, load_config, preset_names
+from sehdr_warp.runs.config_flags import flag_of
 from sehdr_warp.training.commands import _ending
 
 from .refusals import call

@@ -81,23 +81,14 @@ class DirectionalRender:
 
 @dataclass(frozen=True)
 class CameraTensors:
-    """A camera on a device; all tensors float32.
+    """A camera on a device; all tensors float32."""
 
-    Attributes:
-        width: Pixels.
-        height: Pixels.
-        world_to_camera: [4, 4].
-        intrinsics: [4] fx, fy, cx, cy.
-        position: [3] in the coordinates that world_to_camera maps; for a training, normalized ones.
-        directions: [H, W, 3] unit vectors along which the pixels look, world axes; None for a pinhole.
-    """
-
-    width: int
-    height: int
-    world_to_camera: Tensor
-    intrinsics: Tensor
-    position: Tensor
-    directions: Tensor | None = None
+    width: int  # Pixels
+    height: int  # Pixels
+    world_to_camera: Tensor  # [4, 4]
+    intrinsics: Tensor  # [4] fx, fy, cx, cy
+    position: Tensor  # [3] in the coordinates that world_to_camera maps; for a training, normalized ones
+    directions: Tensor | None = None  # [H, W, 3] unit vectors along which pixels look, world axes; None for a pinhole
 
     @staticmethod
     def of(camera: Camera, device: torch.device | str) -> "CameraTensors":

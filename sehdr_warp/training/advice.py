@@ -6,7 +6,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..runs.config_files import config_fields, field_text
+from ..runs.config_files import config_fields
+from ..runs.config_flags import field_text
 from ..runs.run import Run
 from ..runs.scene_description import FOUND
 from ..runs.values import SCENE_OPTIONS, LoadArguments

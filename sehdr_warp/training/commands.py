@@ -15,7 +15,8 @@ from tyro.conf import Positional
 
 from ..errors import InputError, SehdrError, UsageError, missing
 from ..files import require_text
-from ..runs import config_files as configs
+from ..runs.config_files import GONE, RENAMED, load_config, override_config, with_iterations_of
+from ..runs.config_flags import flag_of, flags_type, parse_field, used_fields
 from ..runs.device import pick_device
 from ..runs.open import PhotoRequest, load_scene_and_log_notes
 from ..runs.values import SCENE_OPTIONS, LoadArguments
@@ -94,8 +95,8 @@ class Train:
     """Train a scene from photos of one exposure. A plan leaves out what it does not need; options you set stay."""
 
     removed_flags: ClassVar[Mapping[str, str]] = {
-        **{configs.flag_of(path): advice for path, advice in configs.GONE.items()},
-        **{configs.flag_of(path): f"write {configs.flag_of(name)}" for path, name in configs.RENAMED.items()},
+        **{flag_of(path): advice for path, advice in GONE.items()},
+        **{flag_of(path): f"write {flag_of(name)}" for path, name in RENAMED.items()},
     }
 
     data: Annotated[Positional[str | None], tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
@@ -104,8 +105,8 @@ class Train:
     training: TrainingOptions = TrainingOptions()
     output: OutputOptions = OutputOptions()
     machine: MachineOptions = MachineOptions()
-    # Text of each config field whose flag was used: {table: {path: text}}, see configs.used_fields().
-    fields: Annotated[configs.flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
+    # Text of each config field whose flag was used: {table: {path: text}}, see used_fields().
+    fields: Annotated[flags_type(), tyro.conf.arg(name="")] = field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
 
 
 def run_train(args: Train, argv: Sequence[str]) -> None:
@@ -226,7 +227,7 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
             # Iterating the trainer trains; serve_training() answers browsers between its steps.
             run_with_progress(steps, trainer.total)
     options = {"response": args.scene.response, "preset": args.training.preset, "seed": args.training.seed}
-    repeated = options_of_run(trainer.run) if output.resume else configs.used_fields(args.fields) | options
+    repeated = options_of_run(trainer.run) if output.resume else used_fields(args.fields) | options
     repeated |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
     _print_result(args, trainer.run, advice_on(trainer, data, repeated))
 
@@ -332,15 +333,15 @@ def _config(args: Train, saved: "Config | None") -> "Config":
     shortcuts = {"response.name": args.scene.response, "schedule.iterations": options.iterations, "seed": options.seed}
     overrides = {path: value for path, value in shortcuts.items() if value is not None}
     flags = {"response.name": "--response", "schedule.iterations": "--iterations", "seed": "--seed"}
-    for path, text in configs.used_fields(args.fields).items():
-        overrides[path], flags[path] = configs.parse_field(path, text), configs.flag_of(path)
+    for path, text in used_fields(args.fields).items():
+        overrides[path], flags[path] = parse_field(path, text), flag_of(path)
     if saved is not None and options.preset is None:
-        return configs.override_config(saved, overrides, flags=flags)
-    config = configs.load_config(options.preset or "default", overrides, flags)
+        return override_config(saved, overrides, flags=flags)
+    config = load_config(options.preset or "default", overrides, flags)
     if saved is not None and "schedule.iterations" not in overrides:
-        config = configs.with_iterations_of(saved, config)
+        config = with_iterations_of(saved, config)
     user_fields = {*config.plan.keep, *(path for path in overrides if not path.startswith("plan."))}
-    return configs.override_config(config, {"plan.keep": sorted(user_fields)})
+    return override_config(config, {"plan.keep": sorted(user_fields)})
 
 
 def _ending(path: Path, summary: dict) -> str:

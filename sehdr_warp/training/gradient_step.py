@@ -22,8 +22,8 @@ from ..rasterizer.tile_lists import MAX_SINGLE_SORT
 from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..scene import Scene
+from .flat_gradients import FlatGradients
 from .losses import compared_image, data_loss, extra_images, opacity_loss
-from .optimizer import FlatGradients
 from .ranks import Ranks
 from .scene_facts import largest_hdr_truth
 from .strategies import SEED_STRIDE, Strategy
@@ -36,64 +36,42 @@ intersections than the capacity. Neither kind of step is applied."""
 
 @dataclass(frozen=True)
 class StepOptions:
-    """Options of a step that change in the course of a training.
+    """Options of a step that change in the course of a training."""
 
-    Attributes:
-        degree: SH degree.
-        opacity_weight: Weight of the mean opacity in the loss.
-        needs_means2d_grad: Whether the strategy accumulates the gradients of the projected means.
-    """
-
-    degree: int
-    opacity_weight: float
-    needs_means2d_grad: bool
+    degree: int  # SH degree
+    opacity_weight: float  # Weight of the mean opacity in the loss
+    needs_means2d_grad: bool  # Whether the strategy accumulates the gradients of the projected means
 
 
 class GraphKey(NamedTuple):
     """Everything that a CUDA graph of a step holds fixed, because it changes which kernels the step launches.
 
     Consecutive steps of one key share a CUDA graph; only one is kept, so another key is captured anew.
-
-    Attributes:
-        options: Options of the step.
-        exact_response: Whether Gaussians are so few that a learned response encodes them exactly.
-        single_sort: Whether Gaussians are so few that they are sorted in a single pass.
     """
 
-    options: StepOptions
-    exact_response: bool
-    single_sort: bool
+    options: StepOptions  # Options of the step
+    exact_response: bool  # Whether Gaussians are so few that a learned response encodes them exactly
+    single_sort: bool  # Whether Gaussians are so few that they are sorted in a single pass
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """Result of GradientStep.compute_gradients, beside the gradients that the parameters hold.
+    """Result of GradientStep.compute_gradients, beside the gradients that the parameters hold."""
 
-    Attributes:
-        loss: Scalar loss of this rank's photo.
-        image: [H, W, 3] rendered image that was compared with the photo.
-        rendering: Result of the rasterizer, of which only what apply_gradients() reads is set; other tensors are None.
-        harmonics: Gradients of the harmonics in factored form; None if the parameters hold them.
-    """
-
-    loss: Tensor
-    image: Tensor
-    rendering: Rendering
-    harmonics: HarmonicsGradients | None
+    loss: Tensor  # Scalar loss of this rank's photo
+    image: Tensor  # [H, W, 3] rendered image that was compared with the photo
+    rendering: Rendering  # Of the rasterizer, with what apply_gradients() reads; other tensors are None
+    harmonics: (
+        HarmonicsGradients | None
+    )  # Gradients of the harmonics in factored form; None if the parameters hold them
 
 
 class StepResult(NamedTuple):
-    """Result of a step.
+    """Result of a step."""
 
-    Attributes:
-        loss: Scalar, mean over the ranks.
-        image: [H, W, 3] rendered image that was compared with this rank's photo.
-        intersections: Number of intersections, or the capacity of the step if it had one.
-    """
-
-    loss: Tensor
-    image: Tensor
-    intersections: int
+    loss: Tensor  # Scalar, mean over the ranks
+    image: Tensor  # [H, W, 3] rendered image that was compared with this rank's photo
+    intersections: int  # Number of intersections, or the capacity of the step if it had one
 
 
 class Dropout:

@@ -40,19 +40,12 @@ CHUNK = 1 << 20  # Costs held at one time
 
 @dataclass(frozen=True)
 class Matches:
-    """Matched points, on the matcher's device.
+    """Matched points, on the matcher's device."""
 
-    Attributes:
-        points: [M, 3] float32 world coordinates.
-        colors: [M, 3] float32 encoded values in [0, 1] of the photo.
-        footprints: [M] float32 size that a pixel of the photo covers there, world units.
-        views: [M] int64 index of the photo.
-    """
-
-    points: Tensor
-    colors: Tensor
-    footprints: Tensor
-    views: Tensor
+    points: Tensor  # [M, 3] float32 world coordinates
+    colors: Tensor  # [M, 3] float32 encoded values in [0, 1] of the photo
+    footprints: Tensor  # [M] float32 size that a pixel of the photo covers there, world units
+    views: Tensor  # [M] int64 index of the photo
 
 
 class Matcher:

@@ -33,7 +33,8 @@ from .gradient_step import OVERFLOWED, SKIPPED, GradientStep, StepOptions, StepR
 from .initialization import make_matcher
 from .losses import INTERVALS_FROM
 from .matching import Matcher
-from .optimizer import MovingAverage, make_optimizer, means_rate, set_means_rate
+from .moving_average import MovingAverage
+from .optimizer import make_optimizer, means_rate, set_means_rate
 from .process_settings import interruptible, torch_settings
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
@@ -257,11 +258,11 @@ class Trainer:
         """Refine the Gaussians; on several ranks, rank 0 does and the others receive the result."""
         gaussians, strategy, ranks = self.field.gaussians, self.strategy, self.ranks
         count, reallocations = gaussians.count, gaussians.reallocations
-        make_seeds = self._make_seeds if self._can_seed else None
+        seeding = self._make_seeds if self._can_seed else None
         if ranks is not None:
             ranks.reduce_to_main(list(strategy.state_dict(count).values()))
         changed = (ranks is None or ranks.is_main_process) and strategy.refine(
-            self.iteration, gaussians, self.optimizer, self.generator, make_seeds, self.step_batch
+            self.iteration, gaussians, self.optimizer, self.generator, seeding, self.step_batch
         )
         if ranks is not None:
             changed = ranks.broadcast_refined(changed, strategy, gaussians, self.optimizer)

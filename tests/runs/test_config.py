@@ -18,9 +18,9 @@ from sehdr_warp.runs.config_files import (
     config_from_dict,
     load_config,
     override_config,
-    parse_field,
     preset_names,
 )
+from sehdr_warp.runs.config_flags import parse_field
 from sehdr_warp.training.optimizer import means_rate
 
 PACKAGE = Path(sehdr_warp.__file__).parent

@@ -2,7 +2,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-from sehdr_warp.runs.config_files import load_config, parse_field
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.runs.config_flags import parse_field
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene.pose_conventions import MISFIT
 from sehdr_warp.training.advice import advice, advice_on, option_words, options_of_run

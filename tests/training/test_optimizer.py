@@ -9,7 +9,8 @@ from sehdr_warp.rasterizer.ops.step_updates import decide_step, finiteness_of
 from sehdr_warp.runs.checkpoint import Checkpoint
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.training.optimizer import WINDOWS, MovingAverage, make_optimizer
+from sehdr_warp.training.moving_average import WINDOWS, MovingAverage
+from sehdr_warp.training.optimizer import make_optimizer
 from sehdr_warp.training.train import create_trainer, train
 
 from .toy import QUICK, load_unscaled, toy_field

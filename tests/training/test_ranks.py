@@ -18,8 +18,9 @@ from sehdr_warp.rasterizer import HarmonicsGradients
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training.cost import gain_of_ranks
+from sehdr_warp.training.flat_gradients import FlatGradients
 from sehdr_warp.training.launch import device_of_rank
-from sehdr_warp.training.optimizer import FlatGradients, load_optimizer_tensors, make_optimizer, optimizer_tensors
+from sehdr_warp.training.optimizer import load_optimizer_tensors, make_optimizer, optimizer_tensors
 from sehdr_warp.training.ranks import END, WAIT
 from sehdr_warp.training.strategies import make_strategy
 from sehdr_warp.training.train import train
