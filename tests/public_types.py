@@ -135,6 +135,9 @@ assert_type(gsplat.spherical_harmonics(0, image, image), torch.Tensor)
 assert_type(gsplat.compute_relocation(image[0], image, image[0]), tuple[torch.Tensor, torch.Tensor])
 assert_type(gsplat.isect_offset_encode(image[0], 1, 4, 3), torch.Tensor)
 assert_type(gsplat.isect_tiles(image, image, image[0], 16, 4, 3), tuple[torch.Tensor, torch.Tensor, torch.Tensor])
+assert_type(
+    gsplat.rasterize_to_pixels(image, image, image, image, 64, 48, 16, image, image), tuple[torch.Tensor, torch.Tensor]
+)
 assert_type(gsplat.quat_scale_to_covar_preci(image, image), tuple[torch.Tensor | None, torch.Tensor | None])
 assert_type(
     gsplat.fully_fused_projection(image, None, image, image, image, image, 64, 48), tuple[torch.Tensor | None, ...]

@@ -1,0 +1,170 @@
+"""gsplat's rasterize_to_pixels(): 2D Gaussians, blended over lists of tiles that the caller made."""
+
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...rasterizer.caller_lists import CallerLists, blend_caller_lists
+from ...rasterizer.checks import check_shape, check_tensors, integer
+from ...rasterizer.memory import oom_context
+from ...rasterizer.render_options import MAX_SIDE, image_size
+from ...rasterizer.torch_contract import torch_operation
+
+
+@torch_operation
+def rasterize_to_pixels(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None = None,
+    masks: Tensor | None = None,
+    packed: bool = False,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Blend 2D Gaussians to images, in each tile those that its list names, in the order of the list.
+
+    Args:
+        means2d: [..., N, 2] in pixels; "..." are the axes of the images. Packed: [nnz, 2].
+        conics: [..., N, 3] or [nnz, 3]: a, b, c of the inverse covariances.
+        colors: [..., N, D] or [nnz, D], any D from 1.
+        opacities: [..., N] or [nnz].
+        image_width: of the images, pixels.
+        image_height: of the images, pixels.
+        tile_size: edge of a tile, pixels.
+        isect_offsets: [..., tile_height, tile_width] int32 or int64: where each tile's list begins in flatten_ids. It
+            ends where the next one begins.
+        flatten_ids: [M] int32 or int64: rows of the flattened Gaussians, [... N] or [nnz].
+        backgrounds: [..., D], or [D] for all images.
+        masks: [..., tile_height, tile_width] bool: False for tiles that show the background alone.
+        packed: whether the Gaussians of all images are rows; those of [nnz, 2] always are.
+        absgrad: the backward pass sets means2d.absgrad, the sums over pixels of absolute gradients.
+
+    Returns:
+        Colors [..., H, W, D] and alphas [..., H, W, 1], where "..." are the axes of isect_offsets.
+
+    Raises:
+        TypeError: for what is not a tensor or not an integer.
+        ValueError: for shapes, dtypes, devices or indices that do not fit.
+    """
+    width = integer("image_width", image_width, 1, MAX_SIDE)
+    height = integer("image_height", image_height, 1, MAX_SIDE)
+    size = integer("tile_size", tile_size, 1, MAX_SIDE)
+    image_size(width, height)
+    batch = tuple(means2d.shape[:-2]) if isinstance(means2d, Tensor) and not packed else ()
+    tensors: dict[str, Any] = {
+        "means2d": (means2d, (*batch, "N", 2)),
+        "conics": (conics, (*batch, "N", 3)),
+        "colors": (colors, (*batch, "N", "D")),
+        "opacities": (opacities, (*batch, "N")),
+    }
+    axes = _check_offsets(isect_offsets, batch, size, width, height)
+    if backgrounds is not None:
+        is_shared = isinstance(backgrounds, Tensor) and backgrounds.ndim == 1
+        tensors["backgrounds"] = (backgrounds, (*(() if is_shared else axes), "D"))
+    check_tensors(**tensors)
+    if not colors.shape[-1]:
+        raise ValueError(f"colors has shape {list(colors.shape)}, which has no channel")
+    check_shape("flatten_ids", flatten_ids, [flatten_ids.numel() if isinstance(flatten_ids, Tensor) else 0])
+    indices = {"isect_offsets": isect_offsets, "flatten_ids": flatten_ids}
+    if masks is not None:
+        check_shape("masks", masks, isect_offsets.shape)
+        indices["masks"] = masks
+    for name, tensor in indices.items():
+        expected = (torch.bool,) if name == "masks" else (torch.int32, torch.int64)
+        if tensor.dtype not in expected:
+            raise ValueError(f"{name} is {tensor.dtype}, expected {' or '.join(map(str, expected))}")
+        if tensor.device != means2d.device:
+            raise ValueError(f"{name} is on {tensor.device}, but means2d is on {means2d.device}")
+
+    with oom_context(means2d.device, lambda: (opacities.numel(), width, height, colors.shape[-1])):
+        rows = [
+            tensor.reshape(-1, *tensor.shape[tensor.ndim - own :])
+            for tensor, own in ((means2d, 1), (conics, 1), (opacities, 0), (colors, 1))
+        ]
+        lists = _lists_of_images(isect_offsets, flatten_ids, masks, size, opacities.numel())
+        behind = None if backgrounds is None else backgrounds.expand(*axes, -1).reshape(-1, colors.shape[-1])
+        absolute = _AbsoluteGradients(means2d) if absgrad and means2d.requires_grad else None
+        images, alphas = [], []
+        for index, (first, last, own) in enumerate(lists):
+            store = None if absolute is None else partial(absolute.add, slice(first, last))
+            centers, ellipses, alpha, features = (tensor[first:last] for tensor in rows)
+            image, transmittance = blend_caller_lists(centers, ellipses, alpha, features, own, width, height, store)
+            if behind is not None:
+                image = image + transmittance[..., None] * behind[index]
+            images.append(image)
+            alphas.append(1.0 - transmittance[..., None])
+        results = [torch.stack(each).reshape(axes + each[0].shape) for each in (images, alphas)]
+    for result in results:
+        if absolute is not None and result.requires_grad:
+            result.register_hook(absolute.begin)
+    return results[0], results[1]
+
+
+def _check_offsets(offsets: Any, batch: tuple[int, ...], size: int, width: int, height: int) -> tuple[int, ...]:
+    """Return the axes of images; raise TypeError or ValueError for offsets that do not fit."""
+    if not isinstance(offsets, Tensor):
+        raise TypeError(
+            f"isect_offsets is a {type(offsets).__name__}, expected a tensor [..., tile_height, tile_width]"
+        )
+    *axes, rows, columns = offsets.shape if offsets.ndim > 1 else (0, *offsets.shape, 0)[:3]
+    if offsets.ndim < 2 or (batch and tuple(axes) != batch):
+        expected = ", ".join([*(map(str, batch) if batch else ["..."]), "tile_height", "tile_width"])
+        raise ValueError(f"isect_offsets has shape {list(offsets.shape)}, expected [{expected}]")
+    if 0 in axes:
+        raise ValueError(f"isect_offsets has shape {list(offsets.shape)}, which has no image")
+    if rows * size < height or columns * size < width:
+        raise ValueError(
+            f"isect_offsets has {columns} x {rows} tiles of tile_size {size}, which do not cover an image of "
+            f"{width} x {height} pixels"
+        )
+    return tuple(axes)
+
+
+def _lists_of_images(
+    offsets: Tensor, flatten_ids: Tensor, masks: Tensor | None, size: int, count: int
+) -> list[tuple[int, int, CallerLists]]:
+    """Return for each image the lowest row that its lists name, one past the highest, and lists of rows between them.
+
+    Raises ValueError for offsets that fall, and for rows out of range of the `count` that there are.
+    """
+    total, ids = len(flatten_ids), flatten_ids.long()
+    starts = offsets.flatten().long()
+    ends = torch.cat([starts[1:], starts.new_full((1,), total)])
+    first = starts.reshape(-1, offsets.shape[-2] * offsets.shape[-1])[:, 0]
+    fall, lowest, *firsts = torch.cat([(ends - starts).amin()[None], starts[:1], first]).tolist()
+    if fall < 0 or lowest < 0:
+        raise ValueError(f"isect_offsets has numbers that fall or are not from 0 to {total}, the length of flatten_ids")
+    if masks is not None:
+        ends = torch.where(masks.flatten(), ends, starts)
+    tiles = zip(*(each.reshape(-1, *offsets.shape[-2:]) for each in (starts, ends)), strict=True)
+    lists = []
+    for begin, end, (own_starts, own_ends) in zip(firsts, [*firsts[1:], total], tiles, strict=True):
+        low, high = torch.stack(ids[begin:end].aminmax()).tolist() if end > begin else (0, -1)
+        if low < 0 or high >= count:
+            raise ValueError(f"flatten_ids has numbers from {low} to {high}, expected 0 to {count - 1}")
+        lists.append((low, high + 1, CallerLists(size, own_starts, own_ends, ids - low)))
+    return lists
+
+
+class _AbsoluteGradients:
+    """Sums absolute gradients over images, anew in each backward pass, and sets them as means2d.absgrad."""
+
+    def __init__(self, means2d: Tensor) -> None:
+        self._means2d = means2d
+        self._sums: Tensor
+
+    def begin(self, _: Tensor) -> None:
+        """Begin a backward pass: called before any image's."""
+        self._sums = torch.zeros_like(self._means2d, memory_format=torch.contiguous_format)
+        self._means2d.absgrad = self._sums  # pyright: ignore[reportAttributeAccessIssue]
+
+    def add(self, rows: slice, gradients: Tensor) -> None:
+        self._sums.view(-1, 2)[rows] += gradients
