@@ -136,6 +136,10 @@ assert_type(gsplat.compute_relocation(image[0], image, image[0]), tuple[torch.Te
 assert_type(gsplat.isect_offset_encode(image[0], 1, 4, 3), torch.Tensor)
 assert_type(gsplat.isect_tiles(image, image, image[0], 16, 4, 3), tuple[torch.Tensor, torch.Tensor, torch.Tensor])
 assert_type(
+    gsplat.rasterize_to_indices_in_range(0, 9, image, image, image, image, 64, 48, 16, image, image),
+    tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+)
+assert_type(
     gsplat.rasterize_to_pixels(image, image, image, image, 64, 48, 16, image, image), tuple[torch.Tensor, torch.Tensor]
 )
 assert_type(gsplat.quat_scale_to_covar_preci(image, image), tuple[torch.Tensor | None, torch.Tensor | None])

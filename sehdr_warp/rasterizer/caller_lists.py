@@ -11,12 +11,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..kernels.constants import ALPHA_THRESHOLD, TILE_SIZE
+from ..kernels.constants import ALPHA_MAX, ALPHA_THRESHOLD, TILE_SIZE, TRANSMITTANCE_MIN
 from .absolute_gradient import watch_absolute_gradients
 from .blending import blend
 from .projection import Splats2D
 from .tile_lists import EmitOrder, PackedSplats, TileLists, check_intersection_count, find_tile_ranges, pack_splats
 from .tile_lists import tile_grid as grid_of
+
+MAX_PAIRS = 1 << 22  # Of Gaussians and pixels that contributions() looks at together.
 
 
 class CallerLists(NamedTuple):
@@ -139,3 +141,43 @@ def _own_lists(packed: PackedSplats, lists: CallerLists, width: int, height: int
         emit_order = EmitOrder(indices[:count], gaussians.bincount(minlength=count).cumsum(0))
     total = torch.tensor(length, device=device)
     return TileLists(ranges, gaussians, masks, emit_order, emit_indices, width, height, None, total)
+
+
+@torch.no_grad()
+def contributions(
+    splats: tuple[Tensor, Tensor, Tensor], lists: CallerLists, transmittance: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return which Gaussians contribute to which pixels, [K] int64 each, by pixel and then by place in the list.
+
+    splats: means2d [N, 2], conics [N, 3], opacities [N]. transmittance: [H, W] in front of the lists.
+    """
+    size, (height, width), device = lists.tile_size, transmittance.shape, transmittance.device
+    lengths = (lists.ends - lists.starts).flatten()
+    corners = torch.arange(size, device=device)
+    found = [torch.zeros(2, 0, dtype=torch.int64, device=device)]
+    order = lengths.argsort()[int((lengths <= 0).sum()) :]  # Tiles with lists of about one length together
+    at = 0
+    while at < len(order):
+        tiles = order[at : at + 64]
+        tiles = tiles[: max(1, MAX_PAIRS // (int(lengths[tiles[-1]]) * size * size))]
+        at += len(tiles)
+        nth = torch.arange(int(lengths[tiles[-1]]), device=device)
+        listed = nth < lengths[tiles][:, None]
+        entries = torch.where(listed, lists.starts.flatten()[tiles][:, None] + nth, 0)
+        rows = lists.gaussians[entries]
+        y = (tiles // lists.starts.shape[1] * size)[:, None, None] + corners[:, None]
+        x = (tiles % lists.starts.shape[1] * size)[:, None, None] + corners
+        y, x = (each.flatten(1)[:, None] for each in torch.broadcast_tensors(y, x))
+        means2d, conics, opacities = (each[rows][:, :, None] for each in splats)
+        dx, dy = means2d[..., 0] - x - 0.5, means2d[..., 1] - y - 0.5
+        a, b, c = conics.unbind(-1)
+        exponents = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+        alphas = (opacities * (-exponents).exp()).clamp_max(ALPHA_MAX)
+        counts = (alphas > ALPHA_THRESHOLD) & (exponents >= 0) & listed[..., None] & (x < width) & (y < height)
+        pixels = y.clamp_max(height - 1) * width + x.clamp_max(width - 1)
+        left = torch.where(counts, 1 - alphas, 1.0).cumprod(1) * transmittance.flatten()[pixels]
+        tile, place, pixel = (counts & (left > TRANSMITTANCE_MIN)).nonzero(as_tuple=True)
+        found.append(torch.stack([rows[tile, place], pixels[tile, 0, pixel]]))
+    gaussians, pixels = torch.cat(found, 1)
+    order = pixels.argsort(stable=True)
+    return gaussians[order], pixels[order]

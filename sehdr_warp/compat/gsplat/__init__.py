@@ -6,7 +6,7 @@ docs/gsplat.md lists for each argument whether it is the same, different or not 
 
 from .harmonics import spherical_harmonics
 from .optimizers import SelectiveAdam
-from .pixels import rasterize_to_pixels
+from .pixels import rasterize_to_indices_in_range, rasterize_to_pixels
 from .projection import fully_fused_projection, quat_scale_to_covar_preci
 from .relocation import compute_relocation
 from .rendering import rasterization
@@ -24,6 +24,7 @@ __all__ = [
     "isect_tiles",
     "quat_scale_to_covar_preci",
     "rasterization",
+    "rasterize_to_indices_in_range",
     "rasterize_to_pixels",
     "spherical_harmonics",
 ]

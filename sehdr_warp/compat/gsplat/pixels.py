@@ -1,4 +1,4 @@
-"""gsplat's rasterize_to_pixels(): 2D Gaussians, blended over lists of tiles that the caller made."""
+"""gsplat's rasterize_to_pixels() and rasterize_to_indices_in_range(): images of lists of tiles that the caller made."""
 
 from functools import partial
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...rasterizer.caller_lists import CallerLists, blend_caller_lists
+from ...rasterizer.caller_lists import CallerLists, blend_caller_lists, contributions
 from ...rasterizer.checks import check_shape, check_tensors, integer
 from ...rasterizer.memory import oom_context
 from ...rasterizer.render_options import MAX_SIDE, image_size
@@ -72,17 +72,7 @@ def rasterize_to_pixels(
     check_tensors(**tensors)
     if not colors.shape[-1]:
         raise ValueError(f"colors has shape {list(colors.shape)}, which has no channel")
-    check_shape("flatten_ids", flatten_ids, [flatten_ids.numel() if isinstance(flatten_ids, Tensor) else 0])
-    indices = {"isect_offsets": isect_offsets, "flatten_ids": flatten_ids}
-    if masks is not None:
-        check_shape("masks", masks, isect_offsets.shape)
-        indices["masks"] = masks
-    for name, tensor in indices.items():
-        expected = (torch.bool,) if name == "masks" else (torch.int32, torch.int64)
-        if tensor.dtype not in expected:
-            raise ValueError(f"{name} is {tensor.dtype}, expected {' or '.join(map(str, expected))}")
-        if tensor.device != means2d.device:
-            raise ValueError(f"{name} is on {tensor.device}, but means2d is on {means2d.device}")
+    _check_indices(means2d, isect_offsets, flatten_ids, masks)
 
     with oom_context(means2d.device, lambda: (opacities.numel(), width, height, colors.shape[-1])):
         rows = [
@@ -128,6 +118,21 @@ def _check_offsets(offsets: Any, batch: tuple[int, ...], size: int, width: int, 
     return tuple(axes)
 
 
+def _check_indices(means2d: Tensor, offsets: Tensor, flatten_ids: Any, masks: Any) -> None:
+    """Raise TypeError or ValueError for shapes, dtypes or devices of indices and masks that do not fit."""
+    check_shape("flatten_ids", flatten_ids, [flatten_ids.numel() if isinstance(flatten_ids, Tensor) else 0])
+    indices = {"isect_offsets": offsets, "flatten_ids": flatten_ids}
+    if masks is not None:
+        check_shape("masks", masks, offsets.shape)
+        indices["masks"] = masks
+    for name, tensor in indices.items():
+        expected = (torch.bool,) if name == "masks" else (torch.int32, torch.int64)
+        if tensor.dtype not in expected:
+            raise ValueError(f"{name} is {tensor.dtype}, expected {' or '.join(map(str, expected))}")
+        if tensor.device != means2d.device:
+            raise ValueError(f"{name} is on {tensor.device}, but means2d is on {means2d.device}")
+
+
 def _lists_of_images(
     offsets: Tensor, flatten_ids: Tensor, masks: Tensor | None, size: int, count: int
 ) -> list[tuple[int, int, CallerLists]]:
@@ -152,6 +157,71 @@ def _lists_of_images(
             raise ValueError(f"flatten_ids has numbers from {low} to {high}, expected 0 to {count - 1}")
         lists.append((low, high + 1, CallerLists(size, own_starts, own_ends, ids - low)))
     return lists
+
+
+@torch_operation
+@torch.no_grad()
+def rasterize_to_indices_in_range(
+    range_start: int,
+    range_end: int,
+    transmittances: Tensor,
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return which Gaussians each pixel shows, front to back: of each tile's list a range of batches.
+
+    Args:
+        range_start: first batch, of tile_size^2 Gaussians of a list.
+        range_end: one past the last batch.
+        transmittances: [..., H, W] before the first batch.
+        means2d: [..., N, 2]; this and the others as rasterize_to_pixels() takes them.
+        conics: [..., N, 3].
+        opacities: [..., N].
+        image_width: pixels.
+        image_height: pixels.
+        tile_size: pixels.
+        isect_offsets: [..., tile_height, tile_width].
+        flatten_ids: [M].
+
+    Returns:
+        Gaussians (0 to N - 1), pixels (row by row) and images, [K] int64 each, by image, pixel and place in the list.
+
+    Raises:
+        TypeError: for what is not a tensor or not an integer.
+        ValueError: for shapes, dtypes, devices or indices that do not fit.
+    """
+    width = integer("image_width", image_width, 1, MAX_SIDE)
+    height = integer("image_height", image_height, 1, MAX_SIDE)
+    size = integer("tile_size", tile_size, 1, MAX_SIDE)
+    batches = [integer(*each, 0, 1 << 62) for each in (("range_start", range_start), ("range_end", range_end))]
+    batch = tuple(means2d.shape[:-2]) if isinstance(means2d, Tensor) else ()
+    axes = _check_offsets(isect_offsets, batch, size, width, height)
+    check_tensors(
+        means2d=(means2d, (*batch, "N", 2)),
+        conics=(conics, (*batch, "N", 3)),
+        opacities=(opacities, (*batch, "N")),
+        transmittances=(transmittances, (*axes, height, width)),
+    )
+    _check_indices(means2d, isect_offsets, flatten_ids, None)
+    total, parts = len(flatten_ids), []
+    left, right = (min(each * size * size, total) for each in batches)
+    lists = _lists_of_images(isect_offsets, flatten_ids, None, size, opacities.numel())
+    splats = means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1)
+    for image, (first, _, own) in enumerate(lists):
+        starts, ends = (own.starts + left).minimum(own.ends), (own.starts + right).minimum(own.ends)
+        before = transmittances.reshape(-1, height, width)[image]
+        rows, pixels = contributions(
+            splats, own._replace(starts=starts, ends=ends, gaussians=own.gaussians + first), before
+        )
+        parts.append(torch.stack([rows % max(means2d.shape[-2], 1), pixels, torch.full_like(rows, image)]))
+    gaussians, pixels, images = torch.cat(parts, 1)
+    return gaussians, pixels, images
 
 
 class _AbsoluteGradients:

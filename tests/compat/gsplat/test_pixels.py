@@ -5,7 +5,13 @@ import math
 import pytest
 import torch
 
-from sehdr_warp.compat.gsplat import isect_offset_encode, isect_tiles, rasterization, rasterize_to_pixels
+from sehdr_warp.compat.gsplat import (
+    isect_offset_encode,
+    isect_tiles,
+    rasterization,
+    rasterize_to_indices_in_range,
+    rasterize_to_pixels,
+)
 
 from .scenes import HEIGHT, WIDTH, scene
 
@@ -145,6 +151,44 @@ def test_absolute_gradients_are_sums_over_pixels(device):
         energy.sum().backward(retain_graph=True)
         torch.testing.assert_close(means2d.absgrad, sums, rtol=1e-6, atol=1e-9)
     assert (sums > 0).any()
+
+
+@pytest.mark.parametrize("size", [16, 2])
+def test_what_pixels_show_in_ranges_makes_the_image(size, device):
+    """Blended pixel by pixel, what two ranges of batches name is the image; the second begins where the first ends."""
+    tensors, lists, _, _ = random_lists((2,), 12, size, False)
+    means2d, conics, colors, opacities = (tensor.to(device) for tensor in tensors)
+    opacities = opacities.clamp_min(0.6)
+    lists = [each.to(device) if isinstance(each, torch.Tensor) else each for each in lists]
+    lists[4] = (
+        lists[4] % 12
+        + torch.arange(2, device=device)
+        .repeat_interleave(
+            torch.tensor([int(lists[3][1, 0, 0]), len(lists[4]) - int(lists[3][1, 0, 0])], device=device)
+        )
+        .int()
+        * 12
+    )
+    true, _ = rasterize_to_pixels(means2d, conics, colors, opacities, *lists)
+    width, height = lists[:2]
+    image, left = torch.zeros_like(true), means2d.new_ones(2, height, width)
+    count = 0
+    for first, last in ((0, 1), (1, 10**10)):
+        found = rasterize_to_indices_in_range(first, last, left.clone(), means2d, conics, opacities, *lists)
+        keys = found[2] * width * height + found[1]
+        assert (keys.diff() >= 0).all() and all(each.dtype == torch.int64 for each in found)
+        count += len(keys)
+        for gaussian, pixel, index in zip(*(each.tolist() for each in found), strict=True):
+            y, x = divmod(pixel, width)
+            dx, dy = means2d[index, gaussian] - means2d.new_tensor([x + 0.5, y + 0.5])
+            a, b, c = conics[index, gaussian]
+            alpha = (opacities[index, gaussian] * torch.exp(-(a * dx * dx + c * dy * dy) / 2 - b * dx * dy)).clamp_max(
+                0.999
+            )
+            image[index, y, x] += left[index, y, x] * alpha * colors[index, gaussian]
+            left[index, y, x] *= 1 - alpha
+    torch.testing.assert_close(image, true)
+    assert count > 500
 
 
 def test_what_cannot_be_drawn_is_left_out(device):
