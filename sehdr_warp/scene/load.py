@@ -32,7 +32,7 @@ from .readers.transforms import is_transforms, read_transforms
 from .response_choice import check_response, choose_response
 from .truth_files import assign_truth
 from .types import Scene
-from .unused_files import ARCHIVE_SUFFIXES, unused_notes
+from .unused_files import ARCHIVE_SUFFIXES, unread_cameras, unused_notes
 from .video.decode import UNSTITCHED_SUFFIXES, is_video
 from .video.frames import read_video
 
@@ -154,7 +154,7 @@ def parse_dataset(
     folder = _folder(path)
     dataset = read_video(folder, cache) if is_video(folder) else _read(folder, scans=not cameras)
     name = str(path) if is_embedded(path) else folder.resolve().name
-    folder = folder if dataset.folder == Path() else dataset.folder
+    root, folder = folder, folder if dataset.folder == Path() else dataset.folder
     if not dataset.records:
         raise InputError(folder, "has no views", "check the data folder")
     records, mask_notes = assign_masks(dataset.records, folder)
@@ -180,13 +180,15 @@ def parse_dataset(
     records, camera_notes = check_cameras(records, dataset.cloud)
     records, split_notes = _with_splits(records, dataset, holdout)
     training = sum(record.split == "train" for record in records)
+    unused: list[str] = []
+    if not is_embedded(path) and dataset.format != "video":
+        unused = unused_notes(folder, all_records, [*unplaced, *dataset.mentioned], training)
+        unused += unread_cameras(root)
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
     notes = (*dataset.notes, *mask_notes, *truth_notes, *exposure_notes, *photo_notes, *time_notes)
-    notes = (*notes, *pose_notes, *camera_notes, *split_notes)
-    if not is_embedded(path) and dataset.format != "video":
-        notes = (*notes, *unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]))
+    notes = (*notes, *pose_notes, *camera_notes, *split_notes, *unused)
     return replace(dataset, records=tuple(records), notes=notes, name=name, unplaced=len(unplaced))
 
 

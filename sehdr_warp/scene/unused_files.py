@@ -4,6 +4,7 @@ import os
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
+from ..errors import InputError
 from ..subsets import counted, first_names
 from .dataparser import ImageRecord
 from .file_names import IMAGE_FOLDERS, is_system_file, natural_key, without_mask_mark
@@ -16,22 +17,26 @@ _QUIET = {
     "", ".txt", ".md", ".rst", ".pdf", ".html", ".license", ".log", ".ini", ".db", ".json", ".csv", ".tsv", ".xml",
     ".yaml", ".yml", ".toml", ".xmp", ".pp3", ".dop", ".cos", ".thm", ".aae", ".lrv", ".wav", ".m4a", ".kml", ".gpx",
     ".geo", ".npy", ".npz", ".bin", ".ply", ".obj", ".mtl", ".pt", ".h5", ".pkl", ".psx", ".zip", ".tar", ".gz", ".py",
-    ".sh",
+    ".sh", ".camera",
 }  # fmt: skip
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 _MOST_FILES = 20_000  # Files that are looked at
 
 
-def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collection[str]) -> list[str]:
+def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collection[str], training: int) -> list[str]:
     """Describe the files beside the photos that the set does not use.
 
     Args:
         folder: the data folder.
         records: all photos that the set uses or has left out with a note.
         mentioned: names of further photos that a note names.
+        training: number of photos to train on.
 
     Returns:
         Notes on photos that are in no view, and on files of kinds that are not read.
+
+    Raises:
+        InputError: if the set states cameras of too few photos to train on, and more photos lie in their folder.
     """
     images = [record.image for record in records if not record.derived]
     if not images:
@@ -58,6 +63,9 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         count = counted(len(photos), f"photo of {where} is", f"photos of {where} are")
         # Structure from motion before may have failed, if all photos lie in one folder.
         few = len(photos) > len(images) and {image.parent for image in images} == {Path(place)} != {folder}
+        if few and training < 3:
+            problem = f"states the cameras of {len(images)} of {len(images) + len(photos)} photos"
+            raise InputError(folder, problem, f"give {place}, and the cameras of all photos are found anew")
         remedy = f"; to find cameras of all photos anew, give {place}" * few
         notes.append(f"{count} in no view: {first_names([file.name for file in photos])}{remedy}")
     if broken:
@@ -66,6 +74,12 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
     if others:
         notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
     return notes
+
+
+def unread_cameras(root: Path) -> list[str]:
+    """Name K.txt (openMVG) and *.jpg.camera (Strecha's benchmark) in a folder and those in it: they are not read."""
+    files = [file for name in ("K.txt", "*.camera") for place in ("", "*/") for file in sorted(root.glob(place + name))]
+    return [f"files of cameras that are not read: {first_names([file.name for file in files])}"] if files else []
 
 
 def unread_kinds(folder: Path) -> str:

@@ -49,6 +49,24 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     assert not said(load(tmp_path / "plain"), "in no view") and not said(load(tmp_path / "plain"), "not read")
 
 
+def test_files_of_cameras_beside_photos_are_named(tmp_path):
+    write_colmap(tmp_path)
+    (tmp_path / "gt_cameras").mkdir()
+    (tmp_path / "gt_cameras" / "000.png.camera").write_text("64 0 32\n0 64 24\n0 0 1\n0 0 0\n")
+    (tmp_path / "images" / "K.txt").write_text("64 0 32\n0 64 24\n0 0 1\n")
+    note = "files of cameras that are not read: K.txt, 000.png.camera"
+    assert said(load(tmp_path), "cameras that") == [note]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_cameras_of_too_few_photos_of_a_folder_name_the_folder(tmp_path, count):
+    write_colmap(tmp_path, count)
+    for i in range(9):
+        Image.fromarray(pattern(64, 48)).save(tmp_path / "images" / f"c{i}.png")
+    with pytest.raises(InputError, match=f"cameras of {count} of {count + 9} photos; give {tmp_path / 'images'}, and"):
+        load(tmp_path)
+
+
 def test_the_largest_model_is_used_and_the_others_are_named(tmp_path):
     write_colmap(tmp_path, 9, binary=True)
     (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "1")
