@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -233,9 +233,10 @@ class _Candidates:
     def rows(self, rows: np.ndarray) -> "_Candidates":
         """Return some of the Gaussians."""
         index = self.index[torch.from_numpy(rows).to(self.index.device)]
-        parts = {"index": index, "angles": self.angles[:, rows], "light": self.light[:, rows]}
+        parts: dict[str, Any] = {"index": index, "angles": self.angles[:, rows], "light": self.light[:, rows]}
         others = {name: value for name, value in vars(self).items() if name not in parts}
-        return _Candidates(**parts, **{name: None if value is None else value[rows] for name, value in others.items()})
+        parts |= {name: None if value is None else value[rows] for name, value in others.items()}
+        return _Candidates(**parts)
 
 
 class _LightPhotos(NamedTuple):
