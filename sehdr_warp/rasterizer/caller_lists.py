@@ -64,8 +64,8 @@ def blend_caller_lists(
     means2d, conics, opacities, features = (each.contiguous() for each in (means2d, conics, opacities, features))
     extents = _extents(means2d, conics, opacities)
     splats = Splats2D(means2d, conics, torch.zeros_like(opacities), opacities, extents, features)
-    drawn = torch.where(extents[:, 0] > 0, opacities, 0.0).detach()
-    packed = pack_splats(splats._replace(opacities=drawn), ALPHA_THRESHOLD, 0, 0)  # No tiles: none are counted.
+    visible = splats._replace(opacities=torch.where(extents[:, 0] > 0, opacities, 0.0).detach())
+    packed = pack_splats(visible, ALPHA_THRESHOLD, 0, 0)  # No tiles: none are counted.
     size, image, transmittance = lists.tile_size, None, None
     places = product(range(_most_tiles(height, size)), range(_most_tiles(width, size)))
     x, y = (_place(torch.arange(length, device=means2d.device), size) for length in (width, height))
@@ -106,8 +106,8 @@ def _extents(means2d: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
         cutoffs = 2 * torch.log((opacities.double() / ALPHA_THRESHOLD).clamp_min(1.0))
         extents = (cutoffs[:, None] / (torch.stack([a, c], 1) * relative.clamp_min(0.0)[:, None])).sqrt()
         finite = means2d.isfinite().all(1) & conics.isfinite().all(1) & opacities.isfinite()
-        drawn = finite & (a > 0) & (c > 0) & (relative > -2 * rounding) & (cutoffs > 0)
-        return torch.where(drawn[:, None], extents, 0.0).to(conics.dtype)
+        visible = finite & (a > 0) & (c > 0) & (relative > -2 * rounding) & (cutoffs > 0)
+        return torch.where(visible[:, None], extents, 0.0).to(conics.dtype)
 
 
 @torch.no_grad()

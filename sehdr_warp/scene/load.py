@@ -5,6 +5,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import resources
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -187,8 +188,8 @@ def parse_dataset(
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
-    notes = (*dataset.notes, *mask_notes, *truth_notes, *exposure_notes, *photo_notes, *time_notes)
-    notes = (*notes, *pose_notes, *camera_notes, *split_notes, *unused)
+    notes = dataset.notes, mask_notes, truth_notes, exposure_notes, photo_notes, time_notes
+    notes = tuple(chain(*notes, pose_notes, camera_notes, split_notes, unused))
     return replace(dataset, records=tuple(records), notes=notes, name=name, unplaced=len(unplaced))
 
 

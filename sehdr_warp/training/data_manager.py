@@ -230,4 +230,4 @@ class PhotoStream:
 
 
 DeviceViews = ViewStack | PhotoStream | Sequence[TrainingView]
-"""What DataManager.views is: len() of it is the number of views, [i] is view i."""
+"""Type of DataManager.views: len() of it is the number of views, [i] is view i."""

@@ -30,8 +30,8 @@ from .strategies import SEED_STRIDE, Strategy
 from .training_views import TrainingView
 
 SKIPPED, MOST_INTERSECTIONS, OVERFLOWED = range(3)
-"""Of GradientStep.step_counters: steps that were not finite, the largest number of intersections, and steps with more
-intersections than the capacity. Neither kind of step is applied."""
+"""Indices of GradientStep.step_counters: steps that were not finite, the largest number of intersections, and steps
+with more intersections than the capacity. Neither kind of step is applied."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,7 @@ class Gradients:
     loss: Tensor  # Scalar loss of this rank's photo
     image: Tensor  # [H, W, 3] rendered image that was compared with the photo
     rendering: Rendering  # Of the rasterizer, with what apply_gradients() reads; other tensors are None
-    harmonics: (
-        HarmonicsGradients | None
-    )  # Gradients of the harmonics in factored form; None if the parameters hold them
+    harmonics: HarmonicsGradients | None  # In factored form; None if the parameters hold them
 
 
 class StepResult(NamedTuple):

@@ -1,4 +1,4 @@
-"""What a render is compared with: a photo's codes and HDR truth on the device, and the scale on which codes compare."""
+"""Target of a render: a photo's codes and HDR truth on the device, and the scale on which codes compare."""
 
 import math
 from dataclasses import dataclass

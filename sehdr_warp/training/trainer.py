@@ -40,7 +40,7 @@ from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
 from .scene_facts import is_large
 from .seeding import make_seeds
-from .step_graphs import StepRunner
+from .step_runner import StepRunner
 from .strategies import SEED_STRIDE, Seeds, make_strategy
 from .training_state import TrainingProgress
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sehdr_warp.runs.config_files import override_config
-from sehdr_warp.training import step_graphs
+from sehdr_warp.training import step_runner
 from sehdr_warp.training.strategies import base
 from sehdr_warp.training.training_state import state_of
 
@@ -27,7 +27,7 @@ def trained_steps(scene, config, device, reserves):
 @pytest.mark.parametrize("variant", ["default", "adc"])
 def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monkeypatch):
     monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)  # So few Gaussians become many at once.
-    monkeypatch.setattr(step_graphs, "MAX_RESERVE", 8.0)
+    monkeypatch.setattr(step_runner, "MAX_RESERVE", 8.0)
     config = override_config(VARIANTS[variant], {"deterministic": True, "schedule.use_cuda_graph": False})
     (plain, all_moved), (roomy, moved) = (trained_steps(scene, config, device, reserves) for reserves in (False, True))
     assert all(all_moved) and not any(moved) and len(moved) == len(all_moved) > 1
@@ -42,8 +42,8 @@ def test_reserved_rows_change_nothing_of_a_training(scene, device, variant, monk
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
 def test_recorded_steps_go_on_through_changes_and_wait_only_where_the_count_grows(scene, monkeypatch):
     monkeypatch.setattr(base, "RESERVE_FACTOR", 8.0)
-    monkeypatch.setattr(step_graphs, "MAX_RESERVE", 8.0)
-    monkeypatch.setattr(step_graphs, "MIN_HEADROOM", 0.0)
+    monkeypatch.setattr(step_runner, "MAX_RESERVE", 8.0)
+    monkeypatch.setattr(step_runner, "MIN_HEADROOM", 0.0)
     config = VARIANTS["default"]
     training = make_trainer(scene, config, "cuda:0")
     for _ in range(48):

@@ -1,7 +1,7 @@
 """gsplat's rasterize_to_pixels() and rasterize_to_indices_in_range(): images of lists of tiles that the caller made."""
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -54,10 +54,7 @@ def rasterize_to_pixels(
         TypeError: for what is not a tensor or not an integer.
         ValueError: for shapes, dtypes, devices or indices that do not fit.
     """
-    width = integer("image_width", image_width, 1, MAX_SIDE)
-    height = integer("image_height", image_height, 1, MAX_SIDE)
-    size = integer("tile_size", tile_size, 1, MAX_SIDE)
-    image_size(width, height)
+    width, height, size = _check_sizes(image_width, image_height, tile_size)
     batch = tuple(means2d.shape[:-2]) if isinstance(means2d, Tensor) and not packed else ()
     tensors: dict[str, Any] = {
         "means2d": (means2d, (*batch, "N", 2)),
@@ -91,11 +88,27 @@ def rasterize_to_pixels(
                 image = image + transmittance[..., None] * behind[index]
             images.append(image)
             alphas.append(1.0 - transmittance[..., None])
-        results = [torch.stack(each).reshape(axes + each[0].shape) for each in (images, alphas)]
+        results = [torch.stack(parts).reshape(axes + parts[0].shape) for parts in (images, alphas)]
     for result in results:
         if absolute is not None and result.requires_grad:
             result.register_hook(absolute.begin)
     return results[0], results[1]
+
+
+class _Sizes(NamedTuple):
+    """Sizes of the images and of their tiles, pixels."""
+
+    width: int
+    height: int
+    tile: int
+
+
+def _check_sizes(width: Any, height: Any, tile: Any) -> _Sizes:
+    """Return image_width, image_height and tile_size as integers; raise an error for others."""
+    values = {"image_width": width, "image_height": height, "tile_size": tile}
+    sizes = _Sizes(*(integer(name, value, 1, MAX_SIDE) for name, value in values.items()))
+    image_size(sizes.width, sizes.height)
+    return sizes
 
 
 def _check_offsets(offsets: Any, batch: tuple[int, ...], size: int, width: int, height: int) -> tuple[int, ...]:
@@ -196,10 +209,8 @@ def rasterize_to_indices_in_range(
         TypeError: for what is not a tensor or not an integer.
         ValueError: for shapes, dtypes, devices or indices that do not fit.
     """
-    width = integer("image_width", image_width, 1, MAX_SIDE)
-    height = integer("image_height", image_height, 1, MAX_SIDE)
-    size = integer("tile_size", tile_size, 1, MAX_SIDE)
-    batches = [integer(*each, 0, 1 << 62) for each in (("range_start", range_start), ("range_end", range_end))]
+    width, height, size = _check_sizes(image_width, image_height, tile_size)
+    batches = {"range_start": range_start, "range_end": range_end}
     batch = tuple(means2d.shape[:-2]) if isinstance(means2d, Tensor) else ()
     axes = _check_offsets(isect_offsets, batch, size, width, height)
     check_tensors(
@@ -210,7 +221,7 @@ def rasterize_to_indices_in_range(
     )
     _check_indices(means2d, isect_offsets, flatten_ids, None)
     total, parts = len(flatten_ids), []
-    left, right = (min(each * size * size, total) for each in batches)
+    left, right = (min(integer(name, value, 0, 1 << 62) * size**2, total) for name, value in batches.items())
     lists = _lists_of_images(isect_offsets, flatten_ids, None, size, opacities.numel())
     splats = means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1)
     for image, (first, _, own) in enumerate(lists):
@@ -228,6 +239,7 @@ class _AbsoluteGradients:
     """Sums absolute gradients over images, anew in each backward pass, and sets them as means2d.absgrad."""
 
     def __init__(self, means2d: Tensor) -> None:
+        """Sum for the rows of `means2d` [..., 2]."""
         self._means2d = means2d
         self._sums: Tensor
 
@@ -237,4 +249,5 @@ class _AbsoluteGradients:
         self._means2d.absgrad = self._sums  # pyright: ignore[reportAttributeAccessIssue]
 
     def add(self, rows: slice, gradients: Tensor) -> None:
+        """Add the absolute gradients [n, 2] of an image to rows of the flattened Gaussians."""
         self._sums.view(-1, 2)[rows] += gradients

@@ -5,7 +5,7 @@ After a few calls with the same sizes the next one is captured as CUDA graphs on
 and results out.
 
 This applies to calls of rasterize() and, with packed=False, of gsplat's rasterization(). A training captures its whole
-step as one CUDA graph (training/step_graphs.py); within it, and with max_intersections, calls are launched.
+step as one CUDA graph (training/step_runner.py); within it, and with max_intersections, calls are launched.
 
 A call, from top to bottom: pool_for() returns the GraphPool of calls like it; begin_render() takes one of its graphs
 (render_graph.py), and that GraphInUse renders. torch's backward pass then calls its

@@ -1,6 +1,7 @@
 """gsplat's rasterize_to_pixels(): against its formula in float64, rasterization(), and what torch promises."""
 
 import math
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -18,8 +19,28 @@ from .scenes import HEIGHT, WIDTH, scene
 NAMES = "means2d", "conics", "colors", "opacities"
 
 
-def formula(means2d, conics, colors, opacities, width, height, size, offsets, ids, backgrounds=None, masks=None):
+class Lists(NamedTuple):
+    """The images' size, and a list of Gaussians for each of their tiles."""
+
+    image_width: int
+    image_height: int
+    tile_size: int
+    isect_offsets: torch.Tensor
+    flatten_ids: torch.Tensor
+
+    def to(self, device):
+        return self._replace(isect_offsets=self.isect_offsets.to(device), flatten_ids=self.flatten_ids.to(device))
+
+
+def pixels(leaves, lists, **options):
+    """Images and alphas of means2d, conics, colors and opacities by rasterize_to_pixels()."""
+    return rasterize_to_pixels(*leaves[:4], **lists._asdict(), **options)
+
+
+def formula(gaussians, lists, backgrounds=None, masks=None):
     """The images and alphas of flattened Gaussians, tile by tile, as the sum of 3DGS is written."""
+    means2d, conics, colors, opacities = gaussians
+    width, height, size, offsets, ids = lists
     *axes, rows, columns = offsets.shape
     begins = [*offsets.flatten().tolist(), len(ids)]
     images, alphas = [], []
@@ -53,7 +74,7 @@ def formula(means2d, conics, colors, opacities, width, height, size, offsets, id
             )
         images.append(image_colors)
         alphas.append(image_alphas[..., None])
-    return (torch.stack(each).reshape(*axes, *each[0].shape) for each in (images, alphas))
+    return (torch.stack(parts).reshape([*axes, height, width, -1]) for parts in (images, alphas))
 
 
 def random_lists(axes, count, size, packed, channels=3, width=37, height=26, seed=0):
@@ -75,7 +96,7 @@ def random_lists(axes, count, size, packed, channels=3, width=37, height=26, see
     last = count if packed else math.prod(axes) * count
     ids = torch.cat([torch.randperm(last - 2, generator=generator)[:length] for length in lengths]).int()
     backgrounds, masks = random(*axes, channels), random(*tiles) > 0.2
-    return tensors, (width, height, size, offsets, ids), backgrounds, masks
+    return tensors, Lists(width, height, size, offsets, ids), backgrounds, masks
 
 
 @pytest.mark.parametrize(
@@ -85,18 +106,16 @@ def random_lists(axes, count, size, packed, channels=3, width=37, height=26, see
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_any_lists_give_what_the_formula_gives(axes, packed, size, channels, dtype, device):
     tensors, lists, backgrounds, masks = random_lists(axes, 12, size, packed, channels)
-    lists[4][1:8:3] = lists[4][:7:3]  # Some twice in one list
+    lists.flatten_ids[1:8:3] = lists.flatten_ids[:7:3]  # Some twice in one list
     leaves = [tensor.requires_grad_() for tensor in (*tensors, backgrounds)]
     flat = [tensor.reshape(-1, *tensor.shape[len(tensors[3].shape) :]) for tensor in tensors]
-    colors, alphas = formula(*flat, *lists, backgrounds=leaves[4], masks=masks)
+    colors, alphas = formula(flat, lists, backgrounds=leaves[4], masks=masks)
     weights, by_alpha = torch.rand_like(colors), torch.rand_like(alphas)
     true = torch.autograd.grad((colors * weights).sum() + (alphas * by_alpha).sum(), leaves)
     own = [leaf.detach().to(device, dtype).requires_grad_() for leaf in leaves]
-    indices = [each.to(device) if isinstance(each, torch.Tensor) else each for each in lists]
-    mine, my_alphas = rasterize_to_pixels(
-        *own[:4], *indices, backgrounds=own[4], masks=masks.to(device), packed=packed, absgrad=True
-    )
-    assert mine.shape == (*axes, 26, 37, channels) and my_alphas.shape == (*axes, 26, 37, 1)
+    masks = masks.to(device)
+    mine, my_alphas = pixels(own, lists.to(device), backgrounds=own[4], masks=masks, packed=packed, absgrad=True)
+    assert mine.shape == colors.shape and my_alphas.shape == alphas.shape
     tolerance = {"rtol": 1e-5, "atol": 1e-5 if dtype == torch.float32 else 1e-9}
     torch.testing.assert_close(mine.detach().cpu().double(), colors.detach(), **tolerance)
     torch.testing.assert_close(my_alphas.detach().cpu().double(), alphas.detach(), **tolerance)
@@ -127,12 +146,8 @@ def test_it_is_what_rasterization_renders(packed, size, device):
         means2d, info["radii"], info["depths"], size, info["tile_width"], info["tile_height"], **options
     )
     offsets = isect_offset_encode(isect_ids, 2, info["tile_width"], info["tile_height"])
-    mine, my_alphas = rasterize_to_pixels(
-        *(means2d, info["conics"], own, info["opacities"], WIDTH, HEIGHT, size, offsets, flatten_ids),
-        backgrounds=behind,
-        packed=packed,
-        absgrad=True,
-    )
+    splats, lists = (means2d, info["conics"], own, info["opacities"]), Lists(WIDTH, HEIGHT, size, offsets, flatten_ids)
+    mine, my_alphas = pixels(splats, lists, backgrounds=behind, packed=packed, absgrad=True)
     torch.testing.assert_close(mine, colors, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(my_alphas, alphas, rtol=1e-5, atol=1e-5)
     ((mine * weights).sum() + my_alphas.sum()).backward()
@@ -142,9 +157,9 @@ def test_it_is_what_rasterization_renders(packed, size, device):
 
 def test_absolute_gradients_are_sums_over_pixels(device):
     tensors, lists, _, _ = random_lists((2,), 5, 8, False, width=14, height=10)
-    means2d, *others = [tensor.to(device).requires_grad_() for tensor in tensors]
-    lists = [each.to(device) if isinstance(each, torch.Tensor) else each for each in lists]
-    colors, _ = rasterize_to_pixels(means2d, *others, *lists, absgrad=True)
+    leaves = [tensor.to(device).requires_grad_() for tensor in tensors]
+    means2d = leaves[0]
+    colors, _ = pixels(leaves, lists.to(device), absgrad=True)
     energy = (colors * torch.randn(colors.shape, generator=torch.Generator().manual_seed(2)).to(colors)).sum(-1)
     sums = sum(torch.autograd.grad(each, means2d, retain_graph=True)[0].abs() for each in energy.flatten())
     for _ in range(2):
@@ -158,23 +173,16 @@ def test_what_pixels_show_in_ranges_makes_the_image(size, device):
     """Blended pixel by pixel, what two ranges of batches name is the image; the second begins where the first ends."""
     tensors, lists, _, _ = random_lists((2,), 12, size, False)
     means2d, conics, colors, opacities = (tensor.to(device) for tensor in tensors)
-    opacities = opacities.clamp_min(0.6)
-    lists = [each.to(device) if isinstance(each, torch.Tensor) else each for each in lists]
-    lists[4] = (
-        lists[4] % 12
-        + torch.arange(2, device=device)
-        .repeat_interleave(
-            torch.tensor([int(lists[3][1, 0, 0]), len(lists[4]) - int(lists[3][1, 0, 0])], device=device)
-        )
-        .int()
-        * 12
-    )
-    true, _ = rasterize_to_pixels(means2d, conics, colors, opacities, *lists)
+    opacities, second = opacities.clamp_min(0.6), int(lists.isect_offsets[1, 0, 0])
+    lists.flatten_ids[:second] %= 12  # Each image has its own 12 Gaussians.
+    lists.flatten_ids[second:] = lists.flatten_ids[second:] % 12 + 12
+    lists = lists.to(device)
+    true, _ = pixels((means2d, conics, colors, opacities), lists)
     width, height = lists[:2]
     image, left = torch.zeros_like(true), means2d.new_ones(2, height, width)
     count = 0
     for first, last in ((0, 1), (1, 10**10)):
-        found = rasterize_to_indices_in_range(first, last, left.clone(), means2d, conics, opacities, *lists)
+        found = rasterize_to_indices_in_range(first, last, left.clone(), means2d, conics, opacities, **lists._asdict())
         keys = found[2] * width * height + found[1]
         assert (keys.diff() >= 0).all() and all(each.dtype == torch.int64 for each in found)
         count += len(keys)
@@ -194,19 +202,18 @@ def test_what_pixels_show_in_ranges_makes_the_image(size, device):
 def test_what_cannot_be_drawn_is_left_out(device):
     """Gaussians that are not finite, that are no ellipse, too faint or far away: no image changes, gradients are 0."""
     tensors, lists, _, _ = random_lists((1,), 12, 16, False)
-    lists = [each.to(device) if isinstance(each, torch.Tensor) else each for each in lists]
-    leaves = [tensor.to(device) for tensor in tensors]
+    lists, leaves = lists.to(device), [tensor.to(device) for tensor in tensors]
     with torch.no_grad():
         leaves[0][0, 0], leaves[0][0, 1] = math.nan, torch.tensor([1e30, -1e30])
         leaves[1][0, 2], leaves[1][0, 3] = math.inf, torch.tensor([1.0, 2.0, 1.0])
         leaves[2][0, 4], leaves[3][0, 5], leaves[3][0, 6], leaves[3][0, 7] = math.nan, math.nan, 1 / 256, math.inf
     leaves = [leaf.requires_grad_() for leaf in leaves]
-    colors, alphas = rasterize_to_pixels(*leaves, *lists)
-    used = torch.isin(lists[4], torch.arange(8, device=device), invert=True)
+    colors, alphas = pixels(leaves, lists)
+    used = torch.isin(lists.flatten_ids, torch.arange(8, device=device), invert=True)
     before = torch.cat([used.new_zeros(1, dtype=torch.int64), used.cumsum(0)])
-    kept = [*lists[:3], before[lists[3].long()], lists[4][used]]
+    shorter = lists._replace(isect_offsets=before[lists.isect_offsets.long()], flatten_ids=lists.flatten_ids[used])
     fine = [leaf.detach().nan_to_num(0.0, 0.5, 0.5) for leaf in leaves]
-    true, true_alphas = rasterize_to_pixels(*fine, *kept)
+    true, true_alphas = pixels(fine, shorter)
     assert torch.equal(colors, true) and torch.equal(alphas, true_alphas) and 0 < int(used.sum()) < len(used)
     (colors.sum() + alphas.sum()).backward()
     for leaf in leaves:
@@ -214,18 +221,16 @@ def test_what_cannot_be_drawn_is_left_out(device):
 
 
 def test_needles_are_drawn_whole(device):
-    """Of one that is 1000 times as long as wide float32 leaves little of the determinant."""
+    """Draw a Gaussian 1000 times as long as wide, of whose determinant float32 leaves little."""
     turn, spread = torch.tensor([[0.8, -0.6], [0.6, 0.8]]).double(), torch.tensor([1e3, 1.0]).double()
     conic = torch.linalg.inv(turn * spread.square() @ turn.T).float().to(device)
     conics = torch.stack([conic[0, 0], conic[0, 1], conic[1, 1]])[None, None]
-    splat = torch.tensor([[[20.0, 15.0]]], device=device), conics, torch.ones(1, 1, 1, device=device)
-    lists = (
-        torch.arange(6, dtype=torch.int32, device=device).view(1, 2, 3),
-        torch.zeros(6, dtype=torch.int64, device=device),
-    )
-    colors, _ = rasterize_to_pixels(*splat, torch.full((1, 1), 0.5, device=device), WIDTH, HEIGHT, 16, *lists)
-    flat = [tensor[0].double().cpu() for tensor in splat]
-    true, _ = formula(*flat, torch.tensor([0.5]).double(), WIDTH, HEIGHT, 16, *(each.cpu() for each in lists))
+    center, color = torch.tensor([[[20.0, 15.0]]], device=device), torch.ones(1, 1, 1, device=device)
+    splat = center, conics, color, torch.full((1, 1), 0.5, device=device)
+    offsets = torch.arange(6, dtype=torch.int32).view(1, 2, 3)
+    lists = Lists(WIDTH, HEIGHT, 16, offsets, torch.zeros(6, dtype=torch.int64))
+    colors, _ = pixels(splat, lists.to(device))
+    true, _ = formula([tensor[0].double().cpu() for tensor in splat], lists)
     torch.testing.assert_close(colors.cpu(), true.float(), rtol=1e-4, atol=1e-3)
     assert (colors > 0.4).sum() > 30
 
@@ -236,32 +241,30 @@ def test_gradients_are_derivatives():
     leaves = [
         each.clone().requires_grad_() for each in (tensors[0], spread, tensors[2], tensors[3] * 0.5 + 0.1, backgrounds)
     ]
-    assert torch.autograd.gradcheck(
-        lambda *t: rasterize_to_pixels(*t[:4], *lists, backgrounds=t[4], masks=masks), leaves, atol=1e-6
-    )
+    assert torch.autograd.gradcheck(lambda *t: pixels(t, lists, backgrounds=t[4], masks=masks), leaves, atol=1e-6)
 
 
 def test_torchs_contract():
     tensors, lists, _, _ = random_lists((1,), 9, 16, False)
     leaves = [tensor.float().requires_grad_() for tensor in tensors]
-    colors, _ = rasterize_to_pixels(*leaves, *lists)
+    colors, _ = pixels(leaves, lists)
     once = torch.autograd.grad(colors.sum(), leaves, retain_graph=True)
     twice = torch.autograd.grad(colors.sum(), leaves)
     assert all(map(torch.equal, once, twice))
     with pytest.raises(RuntimeError, match="second time"):
         torch.autograd.grad(colors.sum(), leaves)
-    first = torch.autograd.grad(rasterize_to_pixels(*leaves, *lists)[0].sum(), leaves[0], create_graph=True)[0]
+    first = torch.autograd.grad(pixels(leaves, lists)[0].sum(), leaves[0], create_graph=True)[0]
     with pytest.raises(RuntimeError, match="differentiable once"):
         first.sum().backward()
     changed = leaves[2].clone()
-    image, _ = rasterize_to_pixels(*leaves[:2], changed, leaves[3], *lists)
+    image, _ = pixels((*leaves[:2], changed, leaves[3]), lists)
     changed.mul_(2.0)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         image.sum().backward()
-    compiled = torch.compile(lambda *t: rasterize_to_pixels(*t, *lists)[0] * 2.0, backend="eager")
+    compiled = torch.compile(lambda *t: pixels(t, lists)[0] * 2.0, backend="eager")
     torch.testing.assert_close(compiled(*leaves), colors * 2.0)
     with torch.autocast("cpu", torch.bfloat16):
-        half = rasterize_to_pixels(*leaves[:2], leaves[2].bfloat16(), leaves[3], *lists)[0]
+        half = pixels((*leaves[:2], leaves[2].bfloat16(), leaves[3]), lists)[0]
     assert half.dtype == torch.float32 and bool(((half - colors).abs() < 0.01).all())
 
 
@@ -299,7 +302,6 @@ def test_nothing_to_draw_is_the_background(device):
 )  # fmt: skip
 def test_errors_name_the_argument(change, error, message):
     tensors, lists, _, _ = random_lists((1,), 9, 16, False)
-    names = "image_width", "image_height", "tile_size", "isect_offsets", "flatten_ids"
-    arguments = dict(zip(NAMES + names, [*(tensor.float() for tensor in tensors), *lists], strict=True))
+    arguments = dict(zip(NAMES, (tensor.float() for tensor in tensors), strict=True)) | lists._asdict()
     with pytest.raises(error, match=message):
         rasterize_to_pixels(**(arguments | change))

@@ -7,7 +7,7 @@ import torch
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer.ops.step_updates import decide_step
-from sehdr_warp.training.step_graphs import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
+from sehdr_warp.training.step_runner import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
 
 from .recorded import check_recorded_like_launched
 from .toy import VARIANTS, make_trainer, quick, toy_scene
