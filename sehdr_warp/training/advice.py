@@ -119,9 +119,7 @@ def advice(
     if misfit:
         return [f"the cameras that the set states do not fit its photos; find them anew {anew}"]
     if (share := summary.get("estimated_light") or 0.0) > _MUCH_LIGHT:
-        remedy = (
-            "three darker photos, in which lamps and windows do not clip, would measure it; this says how many stops"
-        )
+        remedy = "photos in which lamps do not clip measure it; this says which lights lack them, and how many stops"
         estimated = f"{share:.0%} of the light is an estimate, because photos clip it"
         lines.append(f"{estimated}; {remedy}: sehdr-warp lights {run}")
     few_placed = 2 * unplaced >= train_photos
