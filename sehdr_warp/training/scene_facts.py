@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,7 +31,7 @@ PLATEAU_SHARE, PLATEAU_EXCESS = 1e-3, 3.0  # Least part of the pixels that they 
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """Figures of a scene's training views; fractions are of 1."""
+    """Figures of a scene's training views; fractions are of 1, and of the pixels that masks keep."""
 
     photos: int  # Number of photos
     pixels: int  # Pixels of all photos
@@ -59,7 +59,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     samples, ray_points = _sample_points(scene, views, seed)
     visible, on_rays = (_in_view(views, points).sum(0) for points in (samples, ray_points))
     read_views = every_nth(views, MOST_VIEWS)
-    figures = np.array([_photo_statistics(view) for view in read_views])
+    figures = _photo_statistics(read_views)
     clipped, black, mean, square, _ = map(float, figures.mean(0))
     longest = 2 * sorted(view.exposure_time for view in photos)[:3][-1]
     dark_views = every_nth([view for view in views if view.exposure_time <= longest], MOST_VIEWS)
@@ -79,7 +79,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         unclipped=scene.light_known and all(view.source and file_kind(view.source) == "float" for view in views),
         plateau=0 if scene.light_known else _plateau(read_views),
         pixel_bytes=pixel_bytes(photos),
-        clipped_when_dark=float(np.mean([_photo_statistics(view)[0] for view in dark_views])),
+        clipped_when_dark=float(_photo_statistics(dark_views)[:, 0].mean()),
     )
 
 
@@ -107,30 +107,36 @@ def _in_view(views: Sequence[View], points: np.ndarray) -> np.ndarray:
     return np.array([view.camera.project(points).inside for view in views])
 
 
-def _photo_statistics(view: View) -> tuple[float, float, float, float, float]:
-    """Return statistics of a photo: clipped and black fractions, mean, mean square, and the median's light in stops.
+def _photo_statistics(views: Sequence[View]) -> np.ndarray:
+    """Return statistics [photos, 5] of photos: clipped and black fractions, mean, mean square, and the median's light.
 
-    The mean is of encoded values, the light by a gamma of 2.2.
+    The mean is of encoded values, the light is in stops, by a gamma of 2.2. Pixels that masks leave out do not count,
+    nor do photos that masks leave out as a whole, unless they are all.
     """
-    image = _sampled(view)
-    clipped, black = (image >= 254.5 / 255).any(2).mean(), (image <= 0.5 / 255).all(2).mean()
-    median = 2.2 * math.log2(max(float(np.median(image)), 0.5 / 255))
-    return clipped, black, image.mean(dtype=np.float64), np.square(image, dtype=np.float64).mean(), median
+
+    def statistics(values: np.ndarray) -> tuple[float, float, float, float, float]:
+        clipped, black = (values >= 254.5 / 255).any(1).mean(), (values <= 0.5 / 255).all(1).mean()
+        median = 2.2 * math.log2(max(float(np.median(values)), 0.5 / 255))
+        return clipped, black, values.mean(dtype=np.float64), np.square(values, dtype=np.float64).mean(), median
+
+    rows = [statistics(values) for view in views if len(values := _sampled(view))]
+    return np.array(rows or [statistics(_sampled(replace(view, mask=None))) for view in views])
 
 
 def _sampled(view: View) -> np.ndarray:
-    """Return the encoded values [h, w, 3] of a photo, sampled on a grid if it has more than MOST_PIXELS."""
+    """Return the encoded values [N, 3] of a photo inside its mask, sampled on a grid if it has over MOST_PIXELS."""
     step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
-    return encoded_values(view.codes[::step, ::step])
+    values = encoded_values(view.codes[::step, ::step])
+    return values.reshape(-1, 3) if view.mask is None else values[view.mask[::step, ::step] > 0.5]
 
 
 def _plateau(views: Sequence[View]) -> int:
     """Return the code of 255, below 255, that is the largest of many pixels of the photos; 0 if there is none."""
     counts = np.zeros(256)
     for view in views:
-        brightest = _sampled(view).max(2)
-        counts += np.bincount(np.rint(255 * brightest).astype(np.int64).ravel(), minlength=256)
-    largest = int(np.flatnonzero(counts)[-1])
+        brightest = _sampled(view).max(1)
+        counts += np.bincount(np.rint(255 * brightest).astype(np.int64), minlength=256)
+    largest = int(counts.nonzero()[0].max(initial=0))
     at, below = (counts[max(0, top - PLATEAU_CODES) : top].sum() for top in (largest + 1, largest + 1 - PLATEAU_CODES))
     is_plateau = at >= PLATEAU_SHARE * counts.sum() and at >= PLATEAU_EXCESS * below
     return largest if is_plateau and LOWEST_PLATEAU <= largest < 255 else 0

@@ -137,6 +137,24 @@ def test_brackets_clip_as_much_as_their_darkest_photos(scene):
     assert measure_scene(scene).clipped_when_dark == measure_scene(scene).clipped
 
 
+def test_facts_count_what_masks_keep(scene):
+    """A subject before a white wall: only the wall clips, and only outside the masks."""
+    wall = np.arange(32)[None, :] < 12
+    views = [
+        replace(
+            view,
+            codes=codes_of(np.where(wall[..., None], 1.0, 0.1 + 0.5 * view.image)),
+            mask=(~wall * np.ones((32, 1)) if masked else np.zeros((32, 32))).astype(np.float32),
+        )
+        for view, masked in zip(scene.views, [True] * (len(scene.views) - 1) + [False], strict=True)
+    ]
+    before = measure_scene(replace(scene, views=tuple(replace(view, mask=None) for view in views)))
+    facts = measure_scene(replace(scene, views=tuple(views)))
+    assert before.clipped == before.clipped_when_dark == 12 / 32
+    assert facts.clipped == facts.clipped_when_dark == facts.plateau == 0
+    assert 0 < facts.contrast < before.contrast
+
+
 def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     shares = iter(np.linspace(0.1, 0.9, len(scene.views)))
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
