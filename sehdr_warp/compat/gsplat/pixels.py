@@ -88,11 +88,11 @@ def rasterize_to_pixels(
                 image = image + transmittance[..., None] * behind[index]
             images.append(image)
             alphas.append(1.0 - transmittance[..., None])
-        results = [torch.stack(parts).reshape(axes + parts[0].shape) for parts in (images, alphas)]
-    for result in results:
-        if absolute is not None and result.requires_grad:
-            result.register_hook(absolute.begin)
-    return results[0], results[1]
+        results = torch.stack(images), torch.stack(alphas)
+        for result in results:  # Not of the views that are returned: a change in place would lose the hook.
+            if absolute is not None and result.requires_grad:
+                result.register_hook(absolute.begin)
+        return results[0].reshape(axes + results[0].shape[1:]), results[1].reshape(axes + results[1].shape[1:])
 
 
 class _Sizes(NamedTuple):
@@ -133,7 +133,9 @@ def _check_offsets(offsets: Any, batch: tuple[int, ...], size: int, width: int, 
 
 def _check_indices(means2d: Tensor, offsets: Tensor, flatten_ids: Any, masks: Any) -> None:
     """Raise TypeError or ValueError for shapes, dtypes or devices of indices and masks that do not fit."""
-    check_shape("flatten_ids", flatten_ids, [flatten_ids.numel() if isinstance(flatten_ids, Tensor) else 0])
+    if not isinstance(flatten_ids, Tensor):
+        raise TypeError(f"flatten_ids is a {type(flatten_ids).__name__}, expected a tensor [M]")
+    check_shape("flatten_ids", flatten_ids, [flatten_ids.numel()])
     indices = {"isect_offsets": offsets, "flatten_ids": flatten_ids}
     if masks is not None:
         check_shape("masks", masks, offsets.shape)
@@ -167,7 +169,7 @@ def _lists_of_images(
     for begin, end, (own_starts, own_ends) in zip(firsts, [*firsts[1:], total], tiles, strict=True):
         low, high = torch.stack(ids[begin:end].aminmax()).tolist() if end > begin else (0, -1)
         if low < 0 or high >= count:
-            raise ValueError(f"flatten_ids has numbers from {low} to {high}, expected 0 to {count - 1}")
+            raise ValueError(f"flatten_ids has numbers from {low} to {high}, expected 0 and up, below {count}")
         lists.append((low, high + 1, CallerLists(size, own_starts, own_ends, ids - low)))
     return lists
 

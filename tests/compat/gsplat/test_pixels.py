@@ -160,6 +160,7 @@ def test_absolute_gradients_are_sums_over_pixels(device):
     leaves = [tensor.to(device).requires_grad_() for tensor in tensors]
     means2d = leaves[0]
     colors, _ = pixels(leaves, lists.to(device), absgrad=True)
+    colors.mul_(0.5)
     energy = (colors * torch.randn(colors.shape, generator=torch.Generator().manual_seed(2)).to(colors)).sum(-1)
     sums = sum(torch.autograd.grad(each, means2d, retain_graph=True)[0].abs() for each in energy.flatten())
     for _ in range(2):
@@ -295,7 +296,8 @@ def test_nothing_to_draw_is_the_background(device):
         ({"isect_offsets": torch.zeros(1, 1, 3).int()}, ValueError, "3 x 1 tiles of tile_size 16, which do not cover"),
         ({"isect_offsets": torch.arange(6, 0, -1).int().view(1, 2, 3)}, ValueError, "isect_offsets has numbers that"),
         ({"flatten_ids": torch.zeros(2, 2).int()}, ValueError, r"flatten_ids has shape \[2, 2\], expected \[4\]"),
-        ({"flatten_ids": torch.full((99,), 9).int()}, ValueError, "flatten_ids has numbers from 9 to 9, expected 0"),
+        ({"flatten_ids": [0]}, TypeError, r"flatten_ids is a list, expected a tensor \[M\]"),
+        ({"flatten_ids": torch.full((99,), 9).int()}, ValueError, "flatten_ids has numbers from 9 to 9, .* below 9"),
         ({"tile_size": 0}, ValueError, r"tile_size 0 is not in 1\.\."),
         ({"image_width": 2.5}, TypeError, r"image_width is 2\.5, expected a whole number"),
     ],
