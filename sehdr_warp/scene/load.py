@@ -183,8 +183,7 @@ def parse_dataset(
     training = sum(record.split == "train" for record in records)
     unused: list[str] = []
     if not is_embedded(path) and dataset.format != "video":
-        unused = unused_notes(folder, all_records, [*unplaced, *dataset.mentioned], training)
-        unused += unread_cameras(root)
+        unused = [*unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]), *unread_cameras(root)]
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")

@@ -23,20 +23,19 @@ ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 _MOST_FILES = 20_000  # Files that are looked at
 
 
-def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collection[str], training: int) -> list[str]:
+def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collection[str]) -> list[str]:
     """Describe the files beside the photos that the set does not use.
 
     Args:
         folder: the data folder.
         records: all photos that the set uses or has left out with a note.
         mentioned: names of further photos that a note names.
-        training: number of photos to train on.
 
     Returns:
         Notes on photos that are in no view, and on files of kinds that are not read.
 
     Raises:
-        InputError: if the set states cameras of too few photos to train on, and more photos lie in their folder.
+        InputError: if the set states cameras of one or two photos, and more photos lie in their folder.
     """
     images = [record.image for record in records if not record.derived]
     if not images:
@@ -63,9 +62,10 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         count = counted(len(photos), f"photo of {where} is", f"photos of {where} are")
         # Structure from motion before may have failed, if all photos lie in one folder.
         few = len(photos) > len(images) and {image.parent for image in images} == {Path(place)} != {folder}
-        if few and training < 3:
+        if few and len(images) < 3:
             problem = f"states the cameras of {len(images)} of {len(images) + len(photos)} photos"
-            raise InputError(folder, problem, f"give {place}, and the cameras of all photos are found anew")
+            or_two = ", or move the others elsewhere" * (len(images) == 2)
+            raise InputError(folder, problem, f"give {place} to find cameras of all{or_two}")
         remedy = f"; to find cameras of all photos anew, give {place}" * few
         notes.append(f"{count} in no view: {first_names([file.name for file in photos])}{remedy}")
     if broken:

@@ -63,8 +63,14 @@ def test_cameras_of_too_few_photos_of_a_folder_name_the_folder(tmp_path, count):
     write_colmap(tmp_path, count)
     for i in range(9):
         Image.fromarray(pattern(64, 48)).save(tmp_path / "images" / f"c{i}.png")
-    with pytest.raises(InputError, match=f"cameras of {count} of {count + 9} photos; give {tmp_path / 'images'}, and"):
+    with pytest.raises(InputError, match=f"cameras of {count} of {count + 9} photos; give {tmp_path / 'images'} to"):
         load(tmp_path)
+    write_blender(tmp_path, 7)  # Its split, and not a search for cameras, leaves few to train on.
+    with edited_json(tmp_path / "transforms.json") as values:
+        names = [frame["file_path"] for frame in values["frames"]]
+        values |= {"train_filenames": names[:2], "val_filenames": [], "test_filenames": names[2:]}
+    shutil.rmtree(tmp_path / "sparse")
+    assert len(load(tmp_path).train_views) == 2
 
 
 def test_the_largest_model_is_used_and_the_others_are_named(tmp_path):

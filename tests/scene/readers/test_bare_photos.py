@@ -152,7 +152,7 @@ def test_depth_and_confidence_beside_photos_are_not_photos(tmp_path):
     assert [record.view for record in dataset.records] == [*(f"IMG_{i}" for i in range(4)), "depth_of_field"]
     note = "18 pictures that are grey and called depth or confidence are left out: depth_0.png, depth_1.png,"
     assert any(each.startswith(note) for each in dataset.notes)
-    assert unused_notes(tmp_path, dataset.records, dataset.mentioned, 3) == []
+    assert unused_notes(tmp_path, dataset.records, dataset.mentioned) == []
 
 
 def test_grey_photos_of_a_conference_room_are_photos(tmp_path):
@@ -322,7 +322,7 @@ def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):
     dataset = find_photos(tmp_path)
     names = [record.image.name for record in dataset.records]
     assert sorted(names) == ["IMG_0.png", "IMG_1.png", "IMG_2.png", "IMG_3.jpg", "IMG_3.png", "IMG_4.jpg", "IMG_4.png"]
-    assert not any("no view" in note for note in unused_notes(tmp_path, dataset.records, dataset.mentioned, 3))
+    assert not any("no view" in note for note in unused_notes(tmp_path, dataset.records, dataset.mentioned))
     (note,) = dataset.notes
     assert note.startswith("3 photos are copies of others and left out: img_0.JPG of IMG_0.png")
 
