@@ -49,7 +49,7 @@ class Light:
             not clip, it is at most MEASURED_STOPS, or what the scene differs from unclipped values.
         share: of the light that reaches the middle of the training cameras, with what hides it from there.
         members: [K] int64, its Gaussians.
-        measured: share of what clips of it that photos of half the exposure or less show unclipped.
+        measured: share of its deviation that is of Gaussians which photos of half the exposure or less show unclipped.
     """
 
     shape: LightShape
@@ -161,10 +161,10 @@ def find_lights(
             continue
         of_clipped = group.weights * np.maximum(group.clipped, 1e-6)
         deviation = None if group.stops is None else float(np.average(_deviations(group), weights=of_clipped))
-        measured = float(np.average(group.measured, weights=of_clipped))
+        measured = deviation and float(np.average(_deviations(group) * group.measured, weights=of_clipped)) / deviation
         share = float(reaches_middle[group.index].sum()) / total
         bound = np.minimum(_certain_radiance(group, photos), radiance)
-        lights.append(Light(shape, radiance, bound, deviation, share, group.index, measured))
+        lights.append(Light(shape, radiance, bound, deviation, share, group.index, measured or 0.0))
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
 
 

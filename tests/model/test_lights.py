@@ -248,6 +248,17 @@ def test_a_light_is_sure_if_a_darker_photo_shows_it_unclipped(darker, direction,
     assert light.deviation == pytest.approx(stops, rel=0.01) and light.measured == (stops < 1)
 
 
+def test_a_darker_photo_of_most_of_a_light_leaves_the_doubt_to_the_rest():
+    """The part that it cuts off is what makes the light uncertain: the scene does not contradict the photo."""
+    scene = field(panel(), RADIANCE, 0.03)
+    scene.clipped_stops = torch.full((scene.gaussians.count,), 1.8)
+    (camera, time), *others = views()
+    ahead = look_at(camera.position, np.add(camera.position, (0, 0, 1)), up=(0, -1, 0))
+    dark = (Camera(256, 192, 240.0, 240.0, 211.0, 96.0, ahead), time / 64)
+    (light,) = find_lights(scene, torch.ones(scene.gaussians.count), [*others, dark])
+    assert 0.6 < light.deviation < 1.0 and light.measured < 0.5
+
+
 def test_a_darker_photo_measures_gaussians_that_are_brighter_than_its_white():
     """Bright Gaussians among dark ones, which blend to pixels below the white of the dark photo."""
     places = panel()
