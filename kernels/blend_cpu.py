@@ -44,7 +44,7 @@ EXP_COEFFICIENTS = (
 
 @cache
 def row_functions(dtype, exp_squarings: int):
-    """Return the type of a row of pixels and functions on rows: broadcast, step, exponential, reached halves of a tile.
+    """Return the type of a row of pixels and functions: broadcast, heaviside, exponential, reached halves of a tile.
 
     float64, the reference, uses the library's exponential. exp_squarings: the polynomial is evaluated at
     p / 2^exp_squarings and squared as often, so that p may go down to -0.7 * 2^exp_squarings.
@@ -62,7 +62,7 @@ def row_functions(dtype, exp_squarings: int):
         return row(value)
 
     @wp.func
-    def step(x: row) -> row:
+    def heaviside(x: row) -> row:
         """Return 1 where x > 0, else 0; compiles to a compare."""
         return wp.min(wp.max(x * real(1.0e30), row(real(0.0))), row(real(1.0)))
 
@@ -100,7 +100,7 @@ def row_functions(dtype, exp_squarings: int):
             reached = wp.vec2i(int(first), int(wp.floor(last)) + 1)
         return reached
 
-    return row, broadcast, step, exponential, reached_halves
+    return row, broadcast, heaviside, exponential, reached_halves
 
 
 def _options(dtype) -> dict:
@@ -129,7 +129,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
         image: [H W, C].
         final_transmittance: [H W], of all Gaussians together.
     """
-    row, broadcast, step, exponential, reached_halves = row_functions(dtype, exp_squarings)
+    row, broadcast, heaviside, exponential, reached_halves = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
@@ -175,9 +175,9 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
                     p = in_x + dx * (-conic_cutoff[1] * dy) + broadcast(real(-0.5) * conic_cutoff[2] * dy * dy)
                     a = wp.min(exponential(wp.min(p, broadcast(real(0.0)))) * xy_opacity[2], broadcast(real(ALPHA_MAX)))
                     t = tile_transmittance[tile, at]
-                    eligible = wp.cw_mul(step(a - broadcast(alpha_threshold)), step(t))
+                    eligible = wp.cw_mul(heaviside(a - broadcast(alpha_threshold)), heaviside(t))
                     weight = wp.cw_mul(wp.cw_mul(a, t), eligible)
-                    goes_on = step(t - weight - broadcast(real(TRANSMITTANCE_MIN)))
+                    goes_on = heaviside(t - weight - broadcast(real(TRANSMITTANCE_MIN)))
                     weight = wp.cw_mul(weight, goes_on)
                     # The pixel that this Gaussian finishes keeps its T, negated; finished ones have eligible = 0.
                     finished = eligible - wp.cw_mul(eligible, goes_on)
@@ -220,11 +220,12 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
         grad_from_behind: scratch, [tiles, 32] rows.
         tile_grad_image: scratch, [tiles, C, 32] rows.
         weights, slopes: scratch, [tiles, 16] rows.
-        sums: scratch, [tiles, C + 6] rows.
+        sums: scratch, [tiles, C + 6] rows: gradients of features; sums of slopes times 1, dx, dy, dx dx, dx dy, dy dy.
         grad_intersections: [M, C + 6] in the order of emission: features, conic a b c, x, y, opacity.
     """
-    row, broadcast, step, exponential, reached_halves = row_functions(dtype, exp_squarings)
+    row, broadcast, heaviside, exponential, reached_halves = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
+    of_1, of_x, of_y, of_xx, of_xy, of_yy = range(channels, channels + 6)
 
     @wp.kernel(module="unique", module_options=_options(dtype))
     def blend_backward(
@@ -291,8 +292,8 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
                     p = in_x + dx * (-conic_cutoff[1] * dy) + broadcast(real(-0.5) * conic_cutoff[2] * dy * dy)
                     unclamped = exponential(wp.min(p, broadcast(real(0.0)))) * xy_opacity[2]
                     a = wp.min(unclamped, broadcast(real(ALPHA_MAX)))
-                    not_behind = step(last_contributor[tile, at] - order)
-                    contributes = wp.cw_mul(step(a - broadcast(alpha_threshold)), not_behind)
+                    not_behind = heaviside(last_contributor[tile, at] - order)
+                    contributes = wp.cw_mul(heaviside(a - broadcast(alpha_threshold)), not_behind)
                     inverse = wp.cw_div(ones, ones - a)
                     t = tile_transmittance[tile, at]
                     # As an addition: t * inverse would round each of many faint factors the same way.
@@ -308,7 +309,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
                     weights[tile, j] = weight
                     # alpha = opacity exp(p): the derivative by p is alpha's own, and 0 where alpha is clamped to
                     # its limit
-                    slopes[tile, j] = wp.cw_mul(wp.cw_mul(a, from_a), step(broadcast(real(ALPHA_MAX)) - unclamped))
+                    slopes[tile, j] = wp.cw_mul(wp.cw_mul(a, from_a), heaviside(broadcast(real(ALPHA_MAX)) - unclamped))
 
                 s0 = broadcast(real(0.0))
                 sy = broadcast(real(0.0))
@@ -326,20 +327,20 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
                         total += wp.cw_mul(weights[tile, j], tile_grad_image[tile, channel, half * size + j])
                     sums[tile, channel] = total
                 sx = wp.cw_mul(s0, dx)
-                sums[tile, wp.static(channels)] = sums[tile, wp.static(channels)] + s0
-                sums[tile, wp.static(channels + 1)] = sums[tile, wp.static(channels + 1)] + sx
-                sums[tile, wp.static(channels + 2)] = sums[tile, wp.static(channels + 2)] + sy
-                sums[tile, wp.static(channels + 3)] = sums[tile, wp.static(channels + 3)] + wp.cw_mul(sx, dx)
-                sums[tile, wp.static(channels + 4)] = sums[tile, wp.static(channels + 4)] + wp.cw_mul(sy, dx)
-                sums[tile, wp.static(channels + 5)] = sums[tile, wp.static(channels + 5)] + syy
+                sums[tile, of_1] = sums[tile, of_1] + s0
+                sums[tile, of_x] = sums[tile, of_x] + sx
+                sums[tile, of_y] = sums[tile, of_y] + sy
+                sums[tile, of_xx] = sums[tile, of_xx] + wp.cw_mul(sx, dx)
+                sums[tile, of_xy] = sums[tile, of_xy] + wp.cw_mul(sy, dx)
+                sums[tile, of_yy] = sums[tile, of_yy] + syy
             for channel in range(wp.static(channels)):
                 grad_intersections[target, channel] = wp.dot(sums[tile, channel], ones)
-            sum_0 = wp.dot(sums[tile, wp.static(channels)], ones)
-            sum_x = wp.dot(sums[tile, wp.static(channels + 1)], ones)
-            sum_y = wp.dot(sums[tile, wp.static(channels + 2)], ones)
-            sum_xx = wp.dot(sums[tile, wp.static(channels + 3)], ones)
-            sum_xy = wp.dot(sums[tile, wp.static(channels + 4)], ones)
-            sum_yy = wp.dot(sums[tile, wp.static(channels + 5)], ones)
+            sum_0 = wp.dot(sums[tile, of_1], ones)
+            sum_x = wp.dot(sums[tile, of_x], ones)
+            sum_y = wp.dot(sums[tile, of_y], ones)
+            sum_xx = wp.dot(sums[tile, of_xx], ones)
+            sum_xy = wp.dot(sums[tile, of_xy], ones)
+            sum_yy = wp.dot(sums[tile, of_yy], ones)
             grad_intersections[target, wp.static(channels)] = real(-0.5) * sum_xx
             grad_intersections[target, wp.static(channels + 1)] = -sum_xy
             grad_intersections[target, wp.static(channels + 2)] = real(-0.5) * sum_yy

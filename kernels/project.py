@@ -21,7 +21,7 @@ from .geometry import geometry, matrix
 def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool):
     """Return the projection kernel for one scalar type.
 
-    The kernel's `forward_extents` is the forward pass's extents in the adjoint, and None in the forward pass.
+    The kernel's `visibility` is the forward pass's extents in the adjoint, and None in the forward pass.
 
     antialiased: lower the opacity by sqrt(det / det_blurred), so that the blur by eps2d keeps a Gaussian's energy (Yu
     et al. 2024, Mip-Splatting). differentiate_compensation: differentiate that factor with respect to the covariance,
@@ -58,15 +58,15 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
         opacities: wp.array(dtype=real), world_to_camera: wp.array(dtype=mat44),
         intrinsics: wp.array(dtype=vec4),
         width: int, height: int, near_plane: real, eps2d: real, alpha_threshold: real,
-        forward_extents: wp.array(dtype=vec2),
+        visibility: wp.array(dtype=vec2),
         # outputs
         means2d: wp.array(dtype=vec2), conics: wp.array(dtype=vec3), depths: wp.array(dtype=real),
         opacities2d: wp.array(dtype=real), extents: wp.array(dtype=vec2),
     ):
         i = range_start + wp.tid()
         # In the adjoint: a culled Gaussian has no gradient, and 0 times an infinite derivative must not become one.
-        if forward_extents:
-            if forward_extents[i][0] <= real(0.0):
+        if visibility:
+            if visibility[i][0] <= real(0.0):
                 return
         pose = world_to_camera[0]
         pinhole = intrinsics[0]
@@ -90,15 +90,15 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
         w = real(width)
         h = real(height)
         margin = real(FRUSTUM_MARGIN)
-        jx = wp.clamp(
+        ray_x = wp.clamp(
             x_ratio, -(pinhole[2] + margin * w * real(0.5)) / fx, (w - pinhole[2] + margin * w * real(0.5)) / fx
         )
-        jy = wp.clamp(
+        ray_y = wp.clamp(
             y_ratio, -(pinhole[3] + margin * h * real(0.5)) / fy, (h - pinhole[3] + margin * h * real(0.5)) / fy
         )
         jacobian = mat23(
-            fx * inverse_z, real(0.0), -fx * jx * inverse_z,
-            real(0.0), fy * inverse_z, -fy * jy * inverse_z,
+            fx * inverse_z, real(0.0), -fx * ray_x * inverse_z,
+            real(0.0), fy * inverse_z, -fy * ray_y * inverse_z,
         )
 
         limit = real(LOG_SCALE_MAX)

@@ -41,7 +41,7 @@ def projection_kernel(dtype, antialiased: bool):
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quaternions: wp.array(dtype=vec4),
         opacities: wp.array(dtype=real), position: wp.array(dtype=vec3),
         near_plane: real, footprint: real, smoothing: real, alpha_threshold: real,
-        forward_distances: wp.array(dtype=real),
+        visibility: wp.array(dtype=real),
         # outputs
         caps: wp.array(dtype=vec4), across: wp.array(dtype=vec3), along: wp.array(dtype=vec3),
         opacities2d: wp.array(dtype=real), distances: wp.array(dtype=real),
@@ -50,8 +50,8 @@ def projection_kernel(dtype, antialiased: bool):
         tiny = real(1.0e-30)
         i = range_start + wp.tid()
         # As in project.py: in the adjoint a culled Gaussian has no gradient.
-        if forward_distances:
-            if forward_distances[i] <= real(0.0):
+        if visibility:
+            if visibility[i] <= real(0.0):
                 return
         offset = means[i] - position[0]
         distance = wp.length(offset)

@@ -254,17 +254,17 @@ def tile_ranges_kernel(dtype, key, shift: int):
         if entry > 0:
             before = int(keys[entry - 1] >> key(shift))
         # Lists begin and end here, those of tiles without intersections both.
-        for begun in range(before + 1, wp.min(tile, tiles) + 1):
-            if begun < tiles:
-                tile_ranges[2 * begun] = entry
-            if begun > 0:
-                tile_ranges[2 * begun - 1] = entry
+        for next_tile in range(before + 1, wp.min(tile, tiles) + 1):
+            if next_tile < tiles:
+                tile_ranges[2 * next_tile] = entry
+            if next_tile > 0:
+                tile_ranges[2 * next_tile - 1] = entry
         if entry == keys.shape[0] - 1:
-            for begun in range(tile + 1, tiles + 1):
-                if begun < tiles:
-                    tile_ranges[2 * begun] = entry + 1
-                if begun > 0:
-                    tile_ranges[2 * begun - 1] = entry + 1
+            for next_tile in range(tile + 1, tiles + 1):
+                if next_tile < tiles:
+                    tile_ranges[2 * next_tile] = entry + 1
+                if next_tile > 0:
+                    tile_ranges[2 * next_tile - 1] = entry + 1
         touched = int(0)
         if tile < tiles and subtile_masks.shape[0] > 0:
             gaussian = gaussians[entry]

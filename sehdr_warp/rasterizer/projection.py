@@ -1,7 +1,7 @@
 """Stage one of a render: project Gaussians to the image. 2D Gaussians with their features are called splats.
 
-Outputs of a projection kernel end with one that is 0 if a Gaussian is culled, here called visibility: the extents, or
-of rasterize_directions() the distances. The adjoint reads it, as forward_extents or forward_distances, and no other.
+Outputs of a projection kernel end with one that is 0 if a Gaussian is culled: the extents, or of rasterize_directions()
+the distances. The adjoint reads this one alone, as the argument visibility.
 """
 
 from collections.abc import Callable, Sequence
