@@ -8,10 +8,7 @@ from .quality import EXPOSURES, KNOWN, LEARNED, UPPER_BOUND
 from .report_tables import PAGES, pivot
 from .results import groups, markdown_table, parted
 
-FIRST_TITLE, ENERGY_TITLE = (
-    "trained by",
-    "light energy: median, 5th to 95th percentile",
-)  # Columns of the README's table
+FIRST_TITLE, ENERGY_TITLE = "method", "light energy: median, 5th to 95th percentile"  # Of the README's table
 NOTHING_CLIPS = 0.001  # Largest share of clipped pixels at which nothing counts as clipped
 
 
@@ -81,7 +78,7 @@ def _whole_by_seed(rows: Sequence[Mapping]) -> Iterable[str]:
         yield markdown_table(table, {"method": "", "seed": "d", "gt-max dB": ".2f", "to U": "+.2f"})
 
 
-SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": "", "irradiance off": ".0%", "worst room": ".0%"}
+SHORT = {"method": "", "HDR dB": ".1f", "photos dB": ".1f", "lost": "", "irradiance error": ".0%", "worst room": ".0%"}
 SHORT |= {"light energy": ".2f", "5th to 95th percentile": ""}
 BY_CURVE = {"curve": "", "clips": ".1%"} | {title: form for title, form in SHORT.items() if title != "method"}
 
@@ -89,7 +86,7 @@ BY_CURVE = {"curve": "", "clips": ".1%"} | {title: form for title, form in SHORT
 def in_short(rows: Sequence[Mapping]) -> list[dict]:
     """Return a row for each method: means over scenes of one seed at the middle exposure, with the first curve known.
 
-    "irradiance off" is a mean over scenes, and "worst room" the largest; "light energy" is the median over lights that
+    "irradiance error" is a mean over scenes, "worst room" the largest; "light energy" is the median over lights that
     clip, and "5th to 95th percentile" the range of the 5th to the 95th percentile. None and a dash without figures.
     """
     fields = ("curve", "exposure", "seed")
@@ -101,7 +98,7 @@ def in_short(rows: Sequence[Mapping]) -> list[dict]:
             "HDR dB": fmean(row["gt_max"] for row in mine),
             "photos dB": fmean(row["ldr"] for row in mine),
             "lost": f"{sum(row['lights_lost'] for row in mine)} of {sum(row['lights_count'] for row in mine)} lights",
-            "irradiance off": _over_rows(mine, "irradiance", fmean),
+            "irradiance error": _over_rows(mine, "irradiance", fmean),
             "worst room": _over_rows(mine, "irradiance", max),
             **_light_energy(mine),
         }
@@ -182,10 +179,10 @@ def readme_table(rows: Sequence[Mapping]) -> str:
     """Return the rows of in_short() that the README shows, as Markdown."""
     labels = PAGES["quality"]["readme"]
     short = {row["method"]: row for row in in_short(rows)}
-    titles = FIRST_TITLE, "HDR", "photos", "lights below half", "irradiance off: mean, worst", ENERGY_TITLE
+    titles = FIRST_TITLE, "HDR", "photos", "lights below half", "irradiance error: mean, worst", ENERGY_TITLE
     lines = [f"| {' | '.join(titles)} |", f"| ---{' | -:' * (len(titles) - 1)} |"]
     for row, label in ((short[method], label) for method, label in labels.items() if method in short):
-        off, energy = f"{row['irradiance off']:.0%}, {row['worst room']:.0%}", f"{row['light energy']:.2f}"
+        off, energy = f"{row['irradiance error']:.0%}, {row['worst room']:.0%}", f"{row['light energy']:.2f}"
         lines.append(
             f"| {label} | {row['HDR dB']:.1f} dB | {row['photos dB']:.1f} dB | {row['lost'].removesuffix(' lights')} | "
             f"{off} | {energy}, {row['5th to 95th percentile']} |"

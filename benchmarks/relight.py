@@ -19,8 +19,8 @@ from scenes.generator.render import load_mitsuba
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.files import read_json
 from sehdr_warp.model.light_shapes import LightShape
+from sehdr_warp.output.images.display import encode_srgb
 from sehdr_warp.output.images.ldr_files import quantize, write_picture
-from sehdr_warp.output.images.tonemap import encode_srgb
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
 from sehdr_warp.scene import embedded_folder, look_at
 

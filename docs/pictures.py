@@ -17,8 +17,8 @@ from scipy.ndimage import uniform_filter
 
 import sehdr_warp as sw
 from sehdr_warp.output.cameras.paths import interpolate
-from sehdr_warp.output.images.ldr_files import as_array, quantize
-from sehdr_warp.output.images.tonemap import expose as expose_light
+from sehdr_warp.output.images.display import expose as expose_light
+from sehdr_warp.output.images.ldr_files import quantize
 from sehdr_warp.output.report.comparison import compare, darker_stops
 from sehdr_warp.synth.expose import expose, exposure_ladder
 
@@ -55,7 +55,7 @@ def photographed(photos: str, folder: str, view: str) -> None:
     near = min(others, key=lambda camera: float(np.linalg.norm(camera.position - photo_view.camera.position)))
 
     def rendered(camera: sw.Camera, stops: float = 0.0) -> np.ndarray:
-        return as_array(run.render_ldr(camera, photo_view.exposure_time * 2.0**stops))
+        return run.render_ldr(camera, photo_view.exposure_time * 2.0**stops).cpu().numpy()
 
     between = interpolate([photo_view.camera, near], 3)[1]
     rows = [[photo_view.image, rendered(photo_view.camera)], [rendered(photo_view.camera, -1.5), rendered(between)]]

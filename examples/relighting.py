@@ -15,8 +15,8 @@ import numpy as np
 from PIL import Image
 
 import sehdr_warp as sw
+from sehdr_warp.output.images.display import encode_srgb
 from sehdr_warp.output.images.exr import write_exr
-from sehdr_warp.output.images.tonemap import encode_srgb
 from sehdr_warp.output.lighting.environment_map import latlong
 from sehdr_warp.scene import look_at
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 
 from ..errors import InputError, refuse_paths
-from ..output.images.ldr_files import safe_names
 from ..scene import Scene
+from ..scene.file_names import safe_names
 from ..scene.images.hdr_files import read_hdr
 from ..subsets import first_names
 from .evaluate import Evaluation, Predictions

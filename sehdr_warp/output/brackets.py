@@ -17,6 +17,7 @@ from ..files import atomic_folder, atomic_path, remove, write_json
 from ..model.exposure import Exposure, Items, read_exposures
 from ..own_files import is_own
 from ..scene import Camera
+from ..scene.file_names import safe_names
 from .images.colorspace import from_rec709
 from .images.exr import (
     PAST_HALF,
@@ -27,7 +28,7 @@ from .images.exr import (
     stored_pixel_type,
     write_multipart_exr,
 )
-from .images.ldr_files import exposure_exif, quantize, safe_names, write_picture
+from .images.ldr_files import exposure_exif, quantize, write_picture
 from .picture_header import PictureHeader
 
 log = logging.getLogger(__name__)

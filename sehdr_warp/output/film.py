@@ -19,8 +19,7 @@ from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
 from .images.colorspace import color_space, matrix_to
-from .images.ldr_files import as_array
-from .images.tonemap import display_gain, encode_srgb
+from .images.display import display_gain, encode_srgb
 from .render_views import shared_tone_map
 
 if TYPE_CHECKING:
@@ -134,7 +133,7 @@ def write_film(
                 if abs(aspect - 1) > _SQUARE:
                     stream.codec_context.sample_aspect_ratio = Fraction(aspect).limit_denominator(100)
                 for camera, ev in zip(_with_progress(cameras, out, tell), stops):
-                    hdr = as_array(run.render(camera.resized(width, height)).hdr) * np.float32(2.0**ev)
+                    hdr = run.render(camera.resized(width, height)).hdr.cpu().numpy() * np.float32(2.0**ev)
                     encoded = tone_map(hdr) if tone_map else encode(hdr * np.float32(gain), transfer)
                     for packet in stream.encode(_frame(av, encoded, kind)):
                         container.mux(packet)

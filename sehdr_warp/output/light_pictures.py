@@ -12,8 +12,7 @@ from markupsafe import Markup
 from ..model.color_models import rec709_of
 from ..scene import View
 from .html import EMPTY, data_block, join, markup
-from .images.ldr_files import as_array
-from .images.tonemap import display_gain, encode_srgb
+from .images.display import display_gain, encode_srgb
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
@@ -38,7 +37,7 @@ def photo_light(run: "RenderableScene", view: View) -> np.ndarray:
     light = np.asarray(run.response.decode(view.image), np.float32) / view.exposure_time
     if run.color_matrix is None:
         return light
-    return as_array(rec709_of(torch.from_numpy(light), run.color_matrix, run.response.white / run.base_time))
+    return rec709_of(torch.from_numpy(light), run.color_matrix, run.response.white / run.base_time).cpu().numpy()
 
 
 def photo_for_display(run: "RenderableScene", view: View) -> np.ndarray:

@@ -6,8 +6,7 @@ import numpy as np
 
 from ..progress import format_duration
 from .html import markup, page_file, whole_page
-from .images.ldr_files import as_array
-from .images.tonemap import display_gain
+from .images.display import display_gain
 from .light_pictures import dial
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ def run_html(run: "Run") -> str:
     body, height = markup("<p><b>{}</b> &middot; {}</p>", run.scene_name, " · ".join(figures)), 72
     if opening is not None:
         camera = opening.camera.within(_LONGEST)
-        light = as_array(run.render(camera).hdr) * np.float32(run.base_time)
+        light = run.render(camera).hdr.cpu().numpy() * np.float32(run.base_time)
         body += dial({"scene": light}, run.base_time, display_gain(run.response), "scene")
         height += 34 + round(_LONGEST * camera.height / camera.width)
     script = "".join(map(page_file, ("tables.js", "light.js")))

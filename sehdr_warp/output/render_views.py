@@ -17,10 +17,11 @@ from .brackets import BracketWriter, bracket_exposures, remove_earlier
 from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .cameras.selection import check_cameras, may_move, read_size, select_cameras
 from .images.colorspace import from_rec709
+from .images.display import exposure_for_white
 from .images.exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
-from .images.ldr_files import as_array, quantize, write_picture
+from .images.ldr_files import quantize, write_picture
 from .images.ocio import ocio_view
-from .images.tonemap import ToneMap, exposure_of_white, fit_tone_map
+from .images.tonemap import ToneMap, fit_tone_map
 from .picture_header import PictureHeader
 from .view_images import ViewImages, data_parts, read_aovs, render_images
 from .world_transform import WorldTransform, photos_to_file, photos_to_scene, world_transform
@@ -113,7 +114,7 @@ def render_views(
     views = select_cameras(run, cameras, camera=camera, count=count, size=size, transform=transform, up=up)
     camera_files = _camera_files(run, views, transform, fps, moves=may_move(cameras))
     header = PictureHeader.of(run, transform, colorspace)
-    hdr_exposure = exposure_of_white(run, reference_white)
+    hdr_exposure = exposure_for_white(run, reference_white)
     brackets = None
     if evs is not None or exposures is not None:
         brackets = BracketWriter(
@@ -127,7 +128,7 @@ def render_views(
             group_by=group_by,
         )
         _log_base_exposure(run)
-    to_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_of_white(run, 1.0))
+    to_display = None if ocio is None or view is None else ocio_view(ocio, view, exposure_for_white(run, 1.0))
     empty = []
     with ExitStack() as stack:  # What is entered first takes its place last: brackets do so before cameras.
         for name, text in camera_files.items():
@@ -196,7 +197,7 @@ def _camera_files(
 
     moves: Whether the cameras may be frames of one that moves.
     """
-    pinholes = [view for view in views if view[1].is_pinhole]
+    pinholes = [(name, camera) for name, camera in views if camera.is_pinhole]
     if len(pinholes) < len(views):
         wide = first_names([name for name, camera in views if not camera.is_pinhole], 5)
         log.info("cameras.usda: without %s, because OpenUSD has neither panoramas nor fisheye cameras", wide)
@@ -226,8 +227,8 @@ def _log_base_exposure(run: "RenderableScene") -> None:
 def shared_tone_map(run: "RenderableScene", cameras: Sequence[Camera]) -> ToneMap:
     """Return one tone map for all pictures of some cameras, fitted to a few small renders."""
     small = [camera.within(_FIT_SIZE) for camera in evenly(cameras, _FIT_VIEWS)]
-    renders = [run.render(camera, average=False) for camera in small]
-    return fit_tone_map([as_array(each.hdr) for each in renders], [as_array(each.alpha) for each in renders])
+    renders = [run.render(camera, supersample=False) for camera in small]
+    return fit_tone_map([each.hdr.cpu().numpy() for each in renders], [each.alpha.cpu().numpy() for each in renders])
 
 
 def _hdr_parts(

@@ -24,7 +24,7 @@ from .cameras.opening import camera_facts, opening_facts
 from .cameras.scene_cameras import split_or_all
 from .export.splat_edits import SplatEdits, most_visible, without_strays
 from .html import data_block, join, json_block, page_file, page_markup, whole_page
-from .images.tonemap import display_gain
+from .images.display import display_gain
 from .light_pictures import curve_table
 from .world_transform import WorldTransform, world_transform
 

@@ -13,7 +13,6 @@ from ..errors import SehdrError, did_you_mean
 from ..scene import Camera
 from ..scene.wide_camera import pixel_directions
 from .images.exr import Part, as_data
-from .images.ldr_files import as_array
 from .world_transform import WorldTransform
 
 if TYPE_CHECKING:
@@ -56,11 +55,11 @@ def render_images(
             raise SehdrError(f"{run.path}: AOV {name} was not measured; {remedy}")
     return ViewImages(
         transform.camera(camera),
-        as_array(rendered.hdr),
-        as_array(rendered.alpha),
-        as_array(rendered.depth) * np.float32(transform.scale),
-        confidence=None if confidence is None else as_array(confidence),
-        clipped=None if clipped is None else as_array(clipped),
+        rendered.hdr.cpu().numpy(),
+        rendered.alpha.cpu().numpy(),
+        rendered.depth.cpu().numpy() * np.float32(transform.scale),
+        confidence=None if confidence is None else confidence.cpu().numpy(),
+        clipped=None if clipped is None else clipped.cpu().numpy(),
     )
 
 

@@ -98,13 +98,13 @@ class RenderableScene:
         """Number of Gaussians."""
         return self.field.gaussians.count
 
-    def render(self, camera: Camera, *, average: bool = True) -> RenderedView:
+    def render(self, camera: Camera, *, supersample: bool = True) -> RenderedView:
         """Render HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera.
 
-        With `average`, a pinhole view that is coarser than the photos is rendered as finely as they are and averaged.
+        With `supersample`, a pinhole view coarser than the photos is rendered as finely as they are and averaged.
         Without it, which is faster, lamps smaller than a pixel get 0.7 to 1.6 times their light, and edges are rough.
         """
-        factor = self.samples_across_pixel(camera) if average else 1
+        factor = self.samples_across_pixel(camera) if supersample else 1
         finer = camera.resized(factor * camera.width, factor * camera.height)
         view = as_rec709(self.field.render(finer, degree=self.degree), self.color_matrix, self.field)
         return view.reduced(factor)

@@ -26,6 +26,9 @@ LOOKED_FOR = 20
 """Images of a set by whose names their folder is found."""
 INVERTED_MASK = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which 0 keeps a pixel and every other value leaves it out."""
+# Separators, what Windows forbids, and control characters.
+_FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
+_LONGEST = 120  # Bytes of a name, which get prefixes and suffixes; most file systems take 255
 
 
 def natural_key(name: str) -> tuple:
@@ -256,3 +259,20 @@ def unique_names(records: Sequence[ImageRecord]) -> list[str]:
         names[i] = next(name for name in numbered if name.lower() not in reserved)
         reserved.add(names[i].lower())
     return [names[i] for i in range(len(records))]
+
+
+def safe_names(names: Sequence[str]) -> list[str]:
+    """Return file names for views that are all different, also on systems that ignore case.
+
+    Letters that some system forbids become `_`, leading dots are dropped, names are cut at 120 bytes, and repeated
+    names get a number.
+    """
+    cleaned = [_FORBIDDEN.sub("_", name).strip().lstrip(".").encode("utf-8")[:_LONGEST] for name in names]
+    cleaned = [name.decode("utf-8", "ignore").rstrip(". ") or "view" for name in cleaned]
+    folded, result = {name.casefold() for name in cleaned}, {}
+    for name in cleaned:
+        numbered = (f"{name}_{number}" for number in itertools.count(2))
+        free = (each for each in numbered if (low := each.casefold()) not in folded and low not in result)
+        unique = next(free) if name.casefold() in result else name
+        result[unique.casefold()] = unique
+    return [*result.values()]

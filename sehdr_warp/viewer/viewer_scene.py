@@ -13,7 +13,7 @@ from ..errors import SehdrError
 from ..model.lights import Light, light_name
 from ..output.cameras.opening import camera_facts, opening_facts
 from ..output.export.splat_edits import SplatEdits
-from ..output.images.tonemap import display_gain
+from ..output.images.display import display_gain
 from ..output.light_pictures import curve_table
 from ..output.lighting.unit import luminance_of_one
 from ..output.merged_scene import merge_scenes
@@ -158,7 +158,7 @@ class ViewerScene:
         """
         run, shares, size = self.run, self.clipped if clipped else None, (camera.height, camera.width)
         with torch.no_grad():
-            rendered = self.render(camera, average=False)
+            rendered = self.render(camera, supersample=False)
             light, depth = torch.as_tensor(rendered.hdr), torch.as_tensor(rendered.depth)
             frame = torch.empty((5 + (shares is not None), *size), dtype=torch.float16, device=light.device)
             picture = frame[:4].view(*size, 4)

@@ -135,7 +135,7 @@ def test_pictures_of_half_the_size_are_means_of_the_photos_pixels(embedded_run):
     full, half = run.render(even), run.render(even.resized(even.width // 2, even.height // 2))
     means = full.hdr.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2))
     torch.testing.assert_close(half.hdr, means, rtol=1e-4, atol=1e-5)
-    once = run.render(even.resized(even.width // 2, even.height // 2), average=False)
+    once = run.render(even.resized(even.width // 2, even.height // 2), supersample=False)
     assert float((once.hdr - half.hdr).abs().max()) > 0.01
     assert half.depth.shape == half.alpha.shape == half.hdr.shape[:2]
 

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from sehdr_warp.model.renders import RenderedView
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.images.hdr_files import read_exr_channels
 
@@ -27,11 +29,8 @@ class Entry:
     exposure_time: float = 0.5
 
 
-@dataclass
-class Rendered:
-    hdr: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
+def rendered_view(*images):
+    return RenderedView(*(torch.tensor(image, dtype=torch.float32) for image in images))
 
 
 class GammaResponse:
@@ -85,15 +84,15 @@ class AnalyticRun:
         """Falls from left to right, and from 1; none where it is switched off."""
         if not self.confident:
             return None
-        return np.tile(np.linspace(1, 0, view.width, dtype=np.float32), (view.height, 1))
+        return torch.linspace(1, 0, view.width).expand(view.height, -1)
 
     def render_clipped(self, view):
-        return np.full((view.height, view.width), 0.25, np.float32) if self.confident else None
+        return torch.full((view.height, view.width), 0.25) if self.confident else None
 
     def clipped_share(self):
         return None
 
-    def render(self, view, *, average=True):
+    def render(self, view, *, supersample=True):
         self.rendered += 1
         y, x = np.mgrid[: view.height, : view.width] + 0.5
         rays = (
@@ -102,9 +101,7 @@ class AnalyticRun:
         )
         rays /= np.linalg.norm(rays, axis=2, keepdims=True)
         hdr = self.gain * np.exp(6 * rays - 2 * rays[..., :1]) * 0.1
-        return Rendered(
-            hdr.astype(np.float32), np.full(x.shape, 0.75, np.float32), (2 + x * 0 + y * 1e-4).astype(np.float32)
-        )
+        return rendered_view(hdr, np.full(x.shape, 0.75), 2 + x * 0 + y * 1e-4)
 
 
 def read_exr(path):

@@ -26,7 +26,7 @@ from sehdr_warp.output.commands import (
 from sehdr_warp.output.export.commands import Convert, Export, run_convert, run_export
 from sehdr_warp.output.film import encode, write_film
 from sehdr_warp.output.images.colorspace import color_space
-from sehdr_warp.output.images.tonemap import display_gain
+from sehdr_warp.output.images.display import display_gain
 from sehdr_warp.output.render_views import shared_tone_map
 from sehdr_warp.own_files import LIST
 
@@ -65,7 +65,7 @@ def test_a_film_holds_the_light_and_says_how(tmp_path, transfer, codec, tags):
     assert (context.color_primaries, context.color_trc, context.colorspace) == tags
     gain, tone_map = run.base_time * display_gain(run.response), shared_tone_map(run, cameras)
     for picture, camera in zip(decoded, cameras, strict=True):
-        light = run.render(camera.resized(96, 64)).hdr
+        light = run.render(camera.resized(96, 64)).hdr.numpy()
         expected = tone_map(light) if transfer == "sdr" else encode(light * gain, transfer)
         assert np.abs(picture - expected).mean() < 0.02
     if transfer == "hdr10":  # Clipped where SDR clips it is not: codes of white, and of the light above.
@@ -110,7 +110,7 @@ def test_a_ramp_runs_through_the_stops(tmp_path):
     run, cameras = smooth_run()
     still = [cameras[0]] * 5
     decoded, _ = frames(write_film(run, tmp_path / "f.mp4", still, ev_ramp=(-4, 0)))
-    light = run.render(cameras[0].resized(96, 64)).hdr * run.base_time * display_gain(run.response)
+    light = run.render(cameras[0].resized(96, 64)).hdr.numpy() * run.base_time * display_gain(run.response)
     for stops, picture in zip(range(-4, 1), decoded, strict=True):
         assert picture.mean() == pytest.approx(encode(light * 2.0**stops, "sdr").mean(), abs=0.01)
     assert _ramp("-4:4") == (-4, 4) and _ramp("1.5") == (1.5, 1.5) and _ramp(None) == (0, 0)

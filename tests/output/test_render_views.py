@@ -9,12 +9,12 @@ from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.cameras.paths import interpolate, orbit
 from sehdr_warp.output.cameras.scene_cameras import common_focus
 from sehdr_warp.output.cameras.selection import select_cameras
-from sehdr_warp.output.images.ldr_files import safe_names
-from sehdr_warp.output.images.tonemap import display_gain
+from sehdr_warp.output.images.display import display_gain
 from sehdr_warp.output.render_views import render_views
 from sehdr_warp.own_files import LIST
 from sehdr_warp.scene import Camera, load_cameras
 from sehdr_warp.scene.exposure.compensation import ExposureCompensation
+from sehdr_warp.scene.file_names import safe_names
 
 from .helpers import AnalyticRun, Entry, camera, read_exr
 
@@ -280,7 +280,7 @@ def test_cameras_that_see_nothing_are_warned_of(tmp_path, logged, monkeypatch):
 
     def nothing(view, **options):
         image = rendered(view, **options)
-        image.alpha *= 0.001
+        image.alpha.mul_(0.001)
         return image
 
     monkeypatch.setattr(run, "render", nothing)

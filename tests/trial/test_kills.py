@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sehdr_warp.output.images.tonemap import encode_srgb
+from sehdr_warp.output.images.display import encode_srgb
 from sehdr_warp.own_files import LIST, first_unlisted
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Camera, look_at

@@ -85,10 +85,10 @@ class _Slow(AnalyticRun):
 
     renders = 0
 
-    def render(self, camera, *, average=True):
+    def render(self, camera, *, supersample=True):
         self.renders += 1
         time.sleep(0.02)
-        return super().render(camera, average=average)
+        return super().render(camera, supersample=supersample)
 
 
 def slow(server):
@@ -161,6 +161,6 @@ def test_a_small_save_that_is_averaged_waits_as_a_picture_of_its_finer_pixels(em
 
     client_run, photo = ClientRun(on_renderer, ViewerScene(run, "run"), None), run.cameras[0].camera
     small = photo.resized(photo.width // 2, photo.height // 2)
-    for average in (True, False):
-        assert client_run.render(small, average=average).hdr.shape == (small.height, small.width, 3)
+    for supersample in (True, False):
+        assert client_run.render(small, supersample=supersample).hdr.shape == (small.height, small.width, 3)
     assert sizes == [4 * small.width * small.height, small.width * small.height]

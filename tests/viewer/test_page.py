@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sehdr_warp.output.images.tonemap import display_gain, encode_srgb
+from sehdr_warp.output.images.display import display_gain, encode_srgb
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.scene import Camera
 
@@ -39,7 +39,7 @@ def rest(page):
 def light_of(page, run):
     """What the page shows now, rendered here: exposures at 0 EV [H, W, 3], as display light."""
     camera = Camera.from_dict(page.evaluate("window.viewer.camera()"))
-    return run.render(camera).hdr * run.base_time * display_gain(run.response)
+    return run.render(camera).hdr.numpy() * run.base_time * display_gain(run.response)
 
 
 def slide(page, selector, value):
@@ -268,7 +268,7 @@ def test_brackets_and_a_film_are_saved_and_what_is_wrong_is_told(chromium, serve
 def test_the_dial_of_a_notebook_exposes_in_a_static_page(chromium, tmp_path):
     run = AnalyticRun()
     (tmp_path / "notebook.html").write_text(f'<!DOCTYPE html><meta charset="utf-8"><title>n</title>{run_html(run)}')
-    light = run.render(run.cameras[3].camera).hdr * run.base_time * display_gain(run.response)
+    light = run.render(run.cameras[3].camera).hdr.numpy() * run.base_time * display_gain(run.response)
     with page_of(chromium, (tmp_path / "notebook.html").as_uri()) as page:
         frame = page.frame_locator("iframe")
         frame.locator("output", has_text="s").wait_for()

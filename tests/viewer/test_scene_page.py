@@ -17,8 +17,7 @@ from sehdr_warp.model.pixel_filter import FocalRange
 from sehdr_warp.output.export.commands import Export, run_export
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.export.splat_edits import SplatEdits
-from sehdr_warp.output.images.ldr_files import as_array
-from sehdr_warp.output.images.tonemap import display_gain, encode_srgb
+from sehdr_warp.output.images.display import display_gain, encode_srgb
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.response import response_by_name
@@ -50,7 +49,7 @@ def test_the_page_shows_the_light_of_the_scene(run, tmp_path):
         loaded = time.monotonic() - started
         assert page.text_content("#status") == page.title() and f"{page.title()} &middot; loading<" in file.read_text()
         camera = Camera.from_dict(page.evaluate("document.getElementById('stage').pose"))
-        exposure = as_array(run.render(camera).hdr) * run.base_time
+        exposure = run.render(camera).hdr.cpu().numpy() * run.base_time
         error = pixels(page, "#picture") - run.response.encode(exposure)
         assert -10 * np.log10(np.mean(error**2)) > 38
         page.select_option("#tone", "none")
@@ -182,8 +181,8 @@ def test_gaussians_beyond_the_picture_are_drawn_as_ours_are(tmp_path):
     with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
         page.wait_for_selector(FULL)
         camera = Camera.from_dict(page.evaluate("document.getElementById('stage').pose"))
-        exposure = as_array(run.render(camera).hdr) * run.base_time
-        error = pixels(page, "#picture") - as_array(run.response.encode(torch.as_tensor(exposure)))
+        exposure = run.render(camera).hdr.cpu().numpy() * run.base_time
+        error = pixels(page, "#picture") - run.response.encode(torch.as_tensor(exposure)).cpu().numpy()
         assert exposure.max() > 0.1 and -10 * np.log10(np.mean(error**2)) > 38
 
 

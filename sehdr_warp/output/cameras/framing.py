@@ -10,7 +10,6 @@ import numpy as np
 
 from ...scene import Camera
 from ...subsets import evenly
-from ..images.ldr_files import as_array
 from ..world_transform import scene_up
 from .paths import look_at_pose, moved, orbit, walk, walk_path
 from .scene_cameras import common_focus, surround, training_cameras
@@ -144,10 +143,10 @@ def _in_front_of_obstacles(
 def nearest_depth(run: "RenderableScene", camera: Camera) -> float:
     """Return the depth than which a tenth of the middle of a camera's picture is nearer; infinity if it is empty."""
     small = camera.within(SMALL)
-    rendered = run.render(small, average=False)
+    rendered = run.render(small, supersample=False)
     rows, columns = (slice(side // 5, side - side // 5) for side in (small.height, small.width))
-    depth = as_array(rendered.depth)[rows, columns]
-    depth = depth[(depth > 0) & (as_array(rendered.alpha)[rows, columns] > 0.5)]
+    depth = rendered.depth.cpu().numpy()[rows, columns]
+    depth = depth[(depth > 0) & (rendered.alpha.cpu().numpy()[rows, columns] > 0.5)]
     return float(np.percentile(depth, _BLOCKED)) if depth.size else math.inf
 
 
@@ -155,14 +154,14 @@ def _focus_distance(run: "RenderableScene", cameras: Sequence[Camera]) -> float:
     """Return the median depth in a small render of the middle camera; 1 if it is empty."""
     if not cameras:
         return 1.0
-    depth = as_array(run.render(cameras[len(cameras) // 2].within(SMALL), average=False).depth)
+    depth = run.render(cameras[len(cameras) // 2].within(SMALL), supersample=False).depth.cpu().numpy()
     depth = depth[depth > 0]
     return float(np.median(depth)) if depth.size else 1.0
 
 
 def visible_surface(run: "RenderableScene", camera: Camera) -> np.ndarray:
     """Return points [N, 3] of the surface that a camera shows."""
-    rendered = run.render(camera, average=False)
-    depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)
+    rendered = run.render(camera, supersample=False)
+    depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
     row, column = np.nonzero((depth > 0) & (alpha > 0.5))
     return camera.unproject(column + 0.5, row + 0.5, depth[row, column])

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from ...errors import InputError, SehdrError, did_you_mean, refuse_paths
 from ...scene import Camera
 from ...scene.camera import MAX_SIDE
+from ...scene.file_names import safe_names
 from ...scene.images.ldr_files import MAX_PIXELS
 from ...scene.readers.camera_exchange import EXCHANGE_SUFFIXES
 from ...scene.readers.camera_files import read_camera_file
 from ...splats import cameras_beside
-from ..images.ldr_files import safe_names
 from ..world_transform import WorldTransform, photos_to_scene, world_transform
 from .framing import default_path, widescreen_camera
 from .paths import interpolate

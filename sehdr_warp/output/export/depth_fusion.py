@@ -12,7 +12,6 @@ from ...errors import SehdrError, require_extra
 from ...progress import track_progress
 from ...scene import Camera
 from ...scene.wide_camera import face_cameras, face_size
-from ..images.ldr_files import as_array
 from ..world_transform import WorldTransform
 from .splat_edits import Box, Sphere
 
@@ -56,14 +55,14 @@ def depth_views(
 
 def _depth_view(run: "RenderableScene", camera: Camera, transform: WorldTransform) -> DepthView:
     rendered = run.render(camera)
-    depth = np.where(as_array(rendered.alpha) > _LEAST_ALPHA, as_array(rendered.depth), 0) * transform.scale
+    depth = np.where(rendered.alpha.cpu().numpy() > _LEAST_ALPHA, rendered.depth.cpu().numpy(), 0) * transform.scale
     flat = np.ones(depth.shape, bool)
     for values, smooth in ((depth, flat), (depth.T, flat.T)):
         step = np.abs(np.diff(values, axis=0)) > _EDGE * np.minimum(values[:-1], values[1:])
         smooth[:-1] &= ~step
         smooth[1:] &= ~step
     depth = torch.from_numpy(np.where(flat, depth, 0).astype(np.float32))
-    return DepthView(transform.camera(camera), depth, torch.from_numpy(np.array(as_array(rendered.hdr))))
+    return DepthView(transform.camera(camera), depth, torch.from_numpy(np.array(rendered.hdr.cpu().numpy())))
 
 
 def surface_points(view: DepthView) -> np.ndarray:

@@ -30,7 +30,7 @@ from ...splats import (
 from ...subsets import every_nth, first_names
 from ..brackets import remove_earlier
 from ..cameras.scene_cameras import camera_positions, split_or_all, training_cameras
-from ..images.tonemap import display_gain
+from ..images.display import display_gain
 from ..world_transform import WorldTransform, file_transform, is_y_down, photos_to_file, world_transform
 from .splat_edits import SplatEdits, most_visible, without_strays
 

@@ -21,7 +21,7 @@ from ...scene import Camera
 from ...splats.usd import pxr, writing_usd
 from ...subsets import evenly
 from ..cameras.scene_cameras import split_or_all, training_cameras
-from ..images.tonemap import encode_srgb
+from ..images.display import encode_srgb
 from ..world_transform import WorldTransform, scene_up, world_transform
 from .depth_fusion import (
     MOST_VIEWS,

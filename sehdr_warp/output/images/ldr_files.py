@@ -1,14 +1,11 @@
-"""Write pictures: PNG with 8 or 16 bits and JPEG with EXIF exposure times; and names of their files.
+"""Write pictures: PNG with 8 or 16 bits and JPEG with EXIF exposure times.
 
 Reading is in scene/images/ldr_files.py.
 """
 
 import io
-import re
-from collections.abc import Sequence
 from datetime import datetime
 from fractions import Fraction
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +18,6 @@ from ...scene.images.ldr_files import png16
 
 _EXIF_IFD, _EXPOSURE_TIME, _EXPOSURE_BIAS, _SOFTWARE, _DATE = 0x8769, 0x829A, 0x9204, 0x0131, 0x9003
 EXIF_TIME = "%Y:%m:%d %H:%M:%S"
-# Separators, what Windows forbids, and control characters.
-_FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
-_LONGEST = 120  # Bytes of a name, which get prefixes and suffixes; most file systems take 255
 
 
 def quantize(values: np.ndarray, bits: int = 8) -> np.ndarray:
@@ -71,25 +65,3 @@ def jpeg(encoded: np.ndarray, quality: int = 88, **options: Any) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(quantize(encoded)).save(buffer, "JPEG", quality=quality, optimize=True, **options)
     return buffer.getvalue()
-
-
-def as_array(value) -> np.ndarray:
-    """Return a torch tensor on any device, or an array, as an array."""
-    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
-
-
-def safe_names(names: Sequence[str]) -> list[str]:
-    """Return file names for views that are all different, also on systems that ignore case.
-
-    Letters that some system forbids become `_`, leading dots are dropped, names are cut at 120 bytes, and repeated
-    names get a number.
-    """
-    cleaned = [_FORBIDDEN.sub("_", name).strip().lstrip(".").encode("utf-8")[:_LONGEST] for name in names]
-    cleaned = [name.decode("utf-8", "ignore").rstrip(". ") or "view" for name in cleaned]
-    folded, result = {name.casefold() for name in cleaned}, {}
-    for name in cleaned:
-        numbered = (f"{name}_{number}" for number in count(2))
-        free = (each for each in numbered if (low := each.casefold()) not in folded and low not in result)
-        unique = next(free) if name.casefold() in result else name
-        result[unique.casefold()] = unique
-    return [*result.values()]

@@ -14,9 +14,8 @@ from ...scene import Camera
 from ...scene.wide_camera import typical_focal_length
 from ..cameras.scene_cameras import training_cameras
 from ..images.colorspace import color_space, from_rec709
+from ..images.display import exposure_for_white
 from ..images.exr import Part, as_data, rgb_channels, write_multipart_exr, write_radiance
-from ..images.ldr_files import as_array
-from ..images.tonemap import exposure_of_white
 from ..picture_header import PictureHeader
 from ..world_transform import AXES, WorldTransform, world_transform
 from .map_center import MapCenter, find_center
@@ -106,7 +105,7 @@ def write_environment_map(
     check_map(path, size, layout, axes, beyond, pixel)
     color_space(colorspace)
     transform = world_transform(run, axes, up=up, scale=scale)
-    exposure = exposure_of_white(run, reference_white)
+    exposure = exposure_for_white(run, reference_white)
     check_absent(path, overwrite)
     photos = training_cameras(run)
     center = find_center(run, photos, at, beyond, transform)
@@ -258,20 +257,21 @@ def _averaged_map(rendered: Any, finer: int, white: float) -> RenderedMap:
         height, width, *channels = values.shape
         return values.reshape(height // finer, finer, width // finer, finer, *channels).mean(axis=(1, 3))
 
-    def weighted_mean(values: Any, weight: np.ndarray) -> np.ndarray:
+    def weighted_mean(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Return the mean of values with weights; the mean without where all are 0."""
-        values, total = as_array(values), average(weight)
+        total = average(weight)
         mean = average(values * weight) / np.where(total > 0, total, 1)
         return np.where(total > 0, mean, average(values)).astype(np.float32)
 
-    hdr, alpha, distance = (as_array(values) for values in (rendered.hdr, rendered.alpha, rendered.distance))
+    hdr, alpha, distance = (values.cpu().numpy() for values in (rendered.hdr, rendered.alpha, rendered.distance))
     coverage, light = alpha * (distance > 0), np.maximum(hdr.mean(2), 0)
-    clipped = None if rendered.clipped is None else as_array(rendered.clipped)
+    confidence = None if rendered.confidence is None else rendered.confidence.cpu().numpy()
+    clipped = None if rendered.clipped is None else rendered.clipped.cpu().numpy()
     return RenderedMap(
         average(hdr),
         average(alpha),
         weighted_mean(distance, coverage),
-        None if rendered.confidence is None else weighted_mean(rendered.confidence, coverage),
+        None if confidence is None else weighted_mean(confidence, coverage),
         None if clipped is None else weighted_mean(clipped, light),
         None if clipped is None else average(clipped * np.minimum(light, white)),
     )

@@ -17,9 +17,8 @@ from ...model.lights import Light, ReceivedLight, light_name, received_light
 from ...scene.wide_camera import typical_focal_length
 from ...subsets import first_names
 from ..cameras.scene_cameras import training_cameras
+from ..images.display import exposure_for_white
 from ..images.exr import rgb_channels, write_exr
-from ..images.ldr_files import as_array
-from ..images.tonemap import exposure_of_white
 from ..picture_header import provenance
 from ..world_transform import WorldTransform, world_transform
 from .environment_map import (
@@ -136,7 +135,7 @@ def write_lights(
         raise SehdrError(f"{path}: unseen is for the map of a dome light, and .json has none; write .usda")
     transform = world_transform(run, axes, up=up, scale=scale)
     center = find_center(run, training_cameras(run), at, beyond, transform)
-    factor, unit = exposure_of_white(run, reference_white), "relative radiance"
+    factor, unit = exposure_for_white(run, reference_white), "relative radiance"
     if reference_white is not None:
         unit = f"white is {reference_white:g}"
     elif (luminance := luminance_of_one(run)) is not None:
@@ -340,4 +339,4 @@ def _shows_lights(
         part[index] = 1
     options = {"focal_length": focal, "pixel_angle": 2 * np.pi / size, "beyond": center.beyond, "shares": part}
     rendered = run.render_directions(center.position, latlong(size) @ to_scene, **options)
-    return np.kron(as_array(rendered.clipped) > 0.5, np.ones((8, 8), bool))
+    return np.kron(rendered.clipped.cpu().numpy() > 0.5, np.ones((8, 8), bool))

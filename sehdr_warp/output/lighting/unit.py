@@ -14,7 +14,6 @@ from ...errors import InputError, SehdrError
 from ...files import read_json, write_json
 from ...runs.values import LIGHT_UNIT_FILE
 from ..cameras.scene_cameras import camera_named
-from ..images.ldr_files import as_array
 from ..images.tonemap import LUMINANCE
 
 if TYPE_CHECKING:
@@ -112,7 +111,7 @@ def meter(
     if not (math.isfinite(light) and light > 0):
         raise SehdrError(f"a reading of {reading} is not a positive number")
     rows, columns = (slice(max(0, int(c) - area // 2), int(c) + (area + 1) // 2) for c in (y, x))
-    rendered = float(as_array(run.render(camera).hdr)[rows, columns].mean((0, 1)) @ LUMINANCE)
+    rendered = float(run.render(camera).hdr.cpu().numpy()[rows, columns].mean((0, 1)) @ LUMINANCE)
     if rendered <= 0:
         raise SehdrError(f"the scene is black at {x:g},{y:g} of {view}; read a brighter place")
     clipped = run.render_clipped(camera)

@@ -8,8 +8,7 @@ import numpy as np
 
 from ...scene import View
 from ..cameras.paths import interpolate
-from ..images.ldr_files import as_array
-from ..images.tonemap import display_gain
+from ..images.display import display_gain
 from ..light_pictures import photo_for_display, photo_light
 
 if TYPE_CHECKING:
@@ -109,12 +108,12 @@ def compare(run: "RenderableScene", view: View, views: Sequence[View], scale: fl
         view.name,
         photo=photo_for_display(run, view),
         from_photo=photo_light(run, view),
-        hdr=as_array(render.hdr),
+        hdr=render.hdr.cpu().numpy(),
         exposure_time=view.exposure_time,
         gain=display_gain(run.response),
         truth=None if view.hdr is None else view.hdr / scale,
-        confidence=None if confidence is None else as_array(confidence),
-        new=None if new is None else as_array(new.hdr),
-        alpha=as_array(render.alpha),
-        new_alpha=None if new is None else as_array(new.alpha),
+        confidence=None if confidence is None else confidence.cpu().numpy(),
+        new=None if new is None else new.hdr.cpu().numpy(),
+        alpha=render.alpha.cpu().numpy(),
+        new_alpha=None if new is None else new.alpha.cpu().numpy(),
     )

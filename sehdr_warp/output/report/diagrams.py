@@ -13,7 +13,7 @@ from ...scene import Camera
 from ...subsets import evenly
 from ..cameras.scene_cameras import camera_positions, split_or_all
 from ..html import EMPTY, join, markup
-from ..images.ldr_files import as_array, quantize
+from ..images.ldr_files import quantize
 from .charts import PANELS, training_points
 
 if TYPE_CHECKING:
@@ -119,11 +119,11 @@ def _visible_points(cameras: Sequence[Camera], run: "RenderableScene", up: np.nd
     ceiling, points, colors = max(float(camera.position @ up) for camera in views), [], []
     for camera in views:
         small = camera.resized(_SAMPLES, max(1, round(_SAMPLES * camera.height / camera.width)))
-        rendered = run.render(small, average=False)  # Points alone are read from it.
-        depth, alpha = as_array(rendered.depth), as_array(rendered.alpha)
+        rendered = run.render(small, supersample=False)  # Points alone are read from it.
+        depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
         row, column = np.nonzero((depth > 0) & (alpha > 0.9))
         points.append(small.unproject(column + 0.5, row + 0.5, depth[row, column]))
-        colors.append(as_array(rendered.hdr)[row, column])
+        colors.append(rendered.hdr.cpu().numpy()[row, column])
     all_points, light = np.concatenate(points), np.concatenate(colors)
     below = all_points @ up < ceiling
     order = np.argsort(all_points[below] @ up)

@@ -15,8 +15,9 @@ from ...scene.camera import limited_size
 from ...scene.exposure.times import shutter
 from ...scene.images.downsampling import area_average
 from ..html import EMPTY, join, markup, page_file, whole_page, with_code
+from ..images.display import expose
 from ..images.ldr_files import jpeg
-from ..images.tonemap import expose, fit_tone_map
+from ..images.tonemap import fit_tone_map
 from ..images.ultra_hdr import MOST_STOPS, ultra_hdr
 from ..light_pictures import SPLIT, dial, img, jpeg_source, photo_for_display, side_choices, simulated_photo
 from ..lighting.lights import uncertain_lights

@@ -18,7 +18,8 @@ from ...scene import Scene, View
 from ...scene.exposure.times import shutter
 from ...scene.images.ldr_files import LDR_SUFFIXES, RAW_SUFFIXES
 from ...subsets import evenly
-from ..images.tonemap import expose, fit_tone_map
+from ..images.display import expose
+from ..images.tonemap import fit_tone_map
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare, darker_stops
 from .page import STOPS, report_page, stops_text

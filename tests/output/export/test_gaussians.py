@@ -11,7 +11,7 @@ from sehdr_warp.model.paged_field import PagedField
 from sehdr_warp.output.commands import Render, ViewFileOptions, run_render
 from sehdr_warp.output.export.commands import Convert, Export, run_convert, run_export
 from sehdr_warp.output.export.gaussians import _renderer, export
-from sehdr_warp.output.images.tonemap import display_gain, encode_srgb
+from sehdr_warp.output.images.display import display_gain, encode_srgb
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras

@@ -17,7 +17,7 @@ from sehdr_warp.scene.gravity import UpDirection
 from sehdr_warp.scene.wide_camera import pixel_directions
 
 from ...full_disk import full_disk
-from ..helpers import AnalyticRun, Entry, Rendered
+from ..helpers import AnalyticRun, Entry, rendered_view
 from .test_splat_edits import splats
 
 pytest.importorskip("skimage")
@@ -53,7 +53,7 @@ class BallOnFloor(AnalyticRun):
         depth = np.minimum(ball, floor)
         hdr = np.where((ball < floor)[..., None], RED, GREY).astype(np.float32)
         known = np.isfinite(depth)
-        return Rendered(hdr, known.astype(np.float32), np.where(known, depth, 0).astype(np.float32))
+        return rendered_view(hdr, known, np.where(known, depth, 0))
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_the_floor_is_found_and_a_tilt_of_it(mesh):
 def test_depth_agrees_with_the_scene(mesh):
     run = BallOnFloor()
     camera = run.cameras[-1].camera.within(96)
-    truth, measured = run.render(camera).depth, mesh_depth(mesh, camera)
+    truth, measured = run.render(camera).depth.numpy(), mesh_depth(mesh, camera)
     both = (truth > 0) & (measured > 0)
     assert (measured > 0)[24:72, 24:72].mean() > 0.98
     assert np.median(np.abs(measured - truth)[both] / truth[both]) < 0.01

@@ -9,8 +9,8 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.output.images.colorspace import SPACES, from_rec709
+from sehdr_warp.output.images.display import display_gain
 from sehdr_warp.output.images.ocio import ocio_view
-from sehdr_warp.output.images.tonemap import display_gain
 from sehdr_warp.output.render_views import render_views
 from tests.ocio_config import ocio_config
 
@@ -24,7 +24,7 @@ def test_previews_are_the_view(tmp_path):
     run = AnalyticRun()
     render_views(run, tmp_path, ocio=CONFIG, view="Un-tone-mapped")
     preview = np.asarray(Image.open(tmp_path / "preview" / "t_0.png")) / 255
-    light = run.render(run.cameras[3].camera).hdr * run.base_time * display_gain(run.response)
+    light = run.render(run.cameras[3].camera).hdr.numpy() * run.base_time * display_gain(run.response)
     # Without a tone map this view is sRGB's curve.
     expected = np.clip(light, 0, 1)
     expected = np.where(expected <= 0.0031308, 12.92 * expected, 1.055 * expected ** (1 / 2.4) - 0.055)

@@ -1,6 +1,7 @@
 import numpy as np
 
-from sehdr_warp.output.images.tonemap import ToneMap, encode_srgb, expose, fit_tone_map
+from sehdr_warp.output.images.display import encode_srgb, expose
+from sehdr_warp.output.images.tonemap import ToneMap, fit_tone_map
 
 from ..helpers import radiance
 

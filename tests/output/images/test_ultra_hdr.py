@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.output.images.tonemap import encode_srgb
+from sehdr_warp.output.images.display import encode_srgb
 from sehdr_warp.output.images.ultra_hdr import MOST_STOPS, ultra_hdr
 
 X, Y = np.meshgrid(np.linspace(-5, 5, 256), np.linspace(0, 1, 192))

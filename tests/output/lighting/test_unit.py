@@ -10,7 +10,8 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.output.images.tonemap import LUMINANCE, exposure_of_white
+from sehdr_warp.output.images.display import exposure_for_white
+from sehdr_warp.output.images.tonemap import LUMINANCE
 from sehdr_warp.output.lighting import lights
 from sehdr_warp.output.lighting.environment_map import write_environment_map
 from sehdr_warp.output.lighting.lights import lights_table, write_lights
@@ -104,7 +105,7 @@ def test_lights_are_in_candelas(lit, tmp_path):
 
 def test_lights_are_in_the_units_of_plates_with_a_reference_white(lit, tmp_path):
     meter(lit, "r_0", (16, 12), luminance=250.0)
-    factor = exposure_of_white(lit, 2.0)
+    factor = exposure_for_white(lit, 2.0)
     write_lights(lit, tmp_path / "lights.json", axes="scene", reference_white=2.0)
     lights_file = json.loads((tmp_path / "lights.json").read_text())
     assert lights_file["units"] == "white is 2, linear Rec.709"

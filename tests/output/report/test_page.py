@@ -20,7 +20,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp import output
-from sehdr_warp.output.images.tonemap import display_gain
+from sehdr_warp.output.images.display import display_gain
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report.comparison import Comparison, darker_stops, first_picture
 from sehdr_warp.output.report.diagrams import training_svg
@@ -116,7 +116,7 @@ def test_the_pictures_keep_the_light_and_look_like_photos(tmp_path):
     run, scene = make(tmp_path)
     thumbnail = re.search(r'src="data:image/jpeg;base64,([^"]*)" alt="Scene of v_1"', page(tmp_path))
     decoded = imagecodecs.ultrahdr_decode(base64.b64decode(thumbnail[1])).astype(np.float64)[..., :3]
-    exposure = run.render(scene.views[1].camera).hdr * 0.5
+    exposure = run.render(scene.views[1].camera).hdr.numpy() * 0.5
     light = exposure * display_gain(run.response)
     inside = light < 16
     assert inside.any() and np.median(decoded[inside] / light[inside]) == pytest.approx(1, abs=0.02)

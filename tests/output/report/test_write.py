@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.images.tonemap import display_gain, encode_srgb, expose
+from sehdr_warp.output.images.display import display_gain, encode_srgb, expose
 from sehdr_warp.output.report import write
 from sehdr_warp.output.report.charts import training_chart
 from sehdr_warp.output.report.comparison import Comparison, compare, darker_stops
@@ -27,7 +27,7 @@ def make(folder, *, truth=True, splits=("train", "test", "test"), metrics=METRIC
     run.metrics = lambda: [{"iteration": 1}, *(metrics or ())]
     views = []
     for entry in run.cameras:
-        hdr = run.render(entry.camera).hdr
+        hdr = run.render(entry.camera).hdr.numpy()
         image = run.response.encode(hdr * entry.exposure_time).astype(np.float32)
         known = {"hdr": hdr} if truth else {}
         views.append(View(entry.name, codes_of(image, 16), entry.camera, entry.exposure_time, entry.split, **known))
@@ -77,7 +77,7 @@ def test_stops_show_what_the_photo_lost(tmp_path):
     view = scene.views[1]
     from_photo = run.response.decode(view.image) / view.exposure_time
     confidence = np.full(view.image.shape[:2], 0.25, np.float32)
-    comparison = Comparison(view.name, view.image, from_photo, run.render(view.camera).hdr, 0.5, 1.0, view.hdr)
+    comparison = Comparison(view.name, view.image, from_photo, run.render(view.camera).hdr.numpy(), 0.5, 1.0, view.hdr)
     figure = stops_figure(comparison)
     pictures = [axes.get_images()[0].get_array() for axes in figure.axes]
     np.testing.assert_array_equal(pictures[0], view.image)
