@@ -29,6 +29,7 @@ from .readers.hdr_sets import is_hdr_gs, read_hdr_gs, read_hdr_nerf, read_hdr_ne
 from .readers.llff import read_llff
 from .readers.meshroom import find_sfm, read_meshroom
 from .readers.opensfm import find_reconstruction, read_opensfm
+from .readers.photo_copies import without_copied_tests
 from .readers.transforms import is_transforms, read_transforms
 from .response_choice import check_response, choose_response
 from .truth_files import assign_truth
@@ -258,19 +259,20 @@ def _read(folder: Path, *, scans: bool) -> DataparserOutputs:
 
 def _with_splits(
     records: list[ImageRecord], dataset: DataparserOutputs, holdout: int | None
-) -> tuple[list[ImageRecord], tuple[str, ...]]:
-    """Return the photos with a split each, and a note if the set does not state it."""
-    if holdout is None and any(record.split for record in records):
-        return [replace(record, split=record.split or "train") for record in records], ()
+) -> tuple[list[ImageRecord], list[str]]:
+    """Return the photos with a split each, and notes if the set does not state one that tests new views."""
+    records, copies = without_copied_tests(records)
+    if holdout is None and any(record.split == "test" for record in records):
+        return [replace(record, split=record.split or "train") for record in records], copies
     uncertain = {i for i, record in enumerate(records) if record.uncertain}
     held_out = _held_out(len(records), holdout, dataset.holdout, uncertain)
     records = [replace(record, split="test" if i in held_out else "train") for i, record in enumerate(records)]
     if not held_out:
-        return records, ("no views are held out for testing",)
+        return records, [*copies, "no views are held out for testing"]
     names = [name for name, record in zip(unique_names(records), records, strict=True) if record.split == "test"]
     names_text = first_names(names, 5)
     are = "is" if len(names) == 1 else "are"
-    return records, (f"{len(names)} of {len(records)} views {are} held out for testing: {names_text}",)
+    return records, [*copies, f"{len(names)} of {len(records)} views {are} held out for testing: {names_text}"]
 
 
 def _held_out(

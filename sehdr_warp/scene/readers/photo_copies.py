@@ -10,6 +10,7 @@ import numpy as np
 from ...errors import InputError
 from ...subsets import counted, first_names
 from ..cached_folder import file_digest
+from ..dataparser import ImageRecord
 from ..images.downsampling import area_average
 from ..images.heif import HEIF_SUFFIXES
 from ..images.ldr_files import JPEG_SUFFIXES, LDR_SUFFIXES, PILLOW_ERRORS, open_image, orientation_of, turn_upright
@@ -51,6 +52,33 @@ def copies_note(copies: Mapping[Path, Path]) -> list[str]:
     count = counted(len(copies), "photo is a copy", "photos are copies")
     more = " ..." if len(copies) > 1 else ""
     return [f"{count} of others and left out: {copy.name} of {photo.name}{more}"]
+
+
+def without_copied_tests(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], list[str]]:
+    """Return records without test views whose photo, or one of the same bytes, is trained on, and a note on these.
+
+    Scripts that demand a test split are often given the training photos again.
+    """
+    if not any(record.split == "test" for record in records) or any(record.derived for record in records):
+        return list(records), []
+    trained = {record.image for record in records if record.split != "test"}
+    sizes = {photo.stat().st_size for photo in trained}
+    digests: set[str] = set()
+
+    def is_copy(photo: Path) -> bool:
+        if photo in trained or photo.stat().st_size not in sizes:
+            return photo in trained
+        if not digests:
+            digests.update(map(file_digest, trained))
+        return file_digest(photo) in digests
+
+    copied = [record.split == "test" and is_copy(record.image) for record in records]
+    if not any(copied):
+        return list(records), []
+    names = first_names([record.image.name for record, copy in zip(records, copied, strict=True) if copy])
+    count = counted(sum(copied), "test photo is a training photo", "test photos are training photos")
+    left = [record for record, copy in zip(records, copied, strict=True) if not copy]
+    return left, [f"{count}, too, and left out of the test, because they say nothing about new views: {names}"]
 
 
 def is_depth_map(picture: Path) -> bool:

@@ -1,6 +1,7 @@
 """transforms.json in its dialects, HDR-NeRF's two layouts, LLFF, and cameras to render from."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -182,6 +183,26 @@ def test_names_of_web_addresses(tmp_path):
     frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     _edit(tmp_path, frames=[frames[0] | {"file_path": "images/r%200.png"}, *frames[1:]])
     assert read_transforms(tmp_path).records[0].image.name == "r 0.png"
+
+
+@pytest.mark.parametrize("new", [0, 2])
+@pytest.mark.parametrize("place", ["images", "test"])
+def test_photos_that_are_trained_on_are_not_held_out(tmp_path, place, new):
+    """A test split of the training photos, by name or as copies, tests nothing; its own photos stay."""
+    write_blender(tmp_path, 11)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").unlink()
+    if place != "images":
+        shutil.copytree(tmp_path / "images", tmp_path / place)
+    frames, trained = values["frames"], 11 - new
+    tested = [frame | {"file_path": frame["file_path"].replace("images", place)} for frame in frames]
+    (tmp_path / "transforms_train.json").write_text(json.dumps(values | {"frames": frames[:trained]}))
+    (tmp_path / "transforms_test.json").write_text(json.dumps(values | {"frames": tested}))
+    scene = load(tmp_path)
+    note = f"{trained} test photos are training photos, too, and left out of the test, because they say nothing"
+    assert any(line.startswith(note) for line in scene.notes), scene.notes
+    assert [view.name[-3:] for view in scene.test_views] == (["r_9", "_10"] if new else ["r_4"])
+    assert len(scene.train_views) == (9 if new else 10)
 
 
 def test_fields_that_are_not_read_are_named(tmp_path):
