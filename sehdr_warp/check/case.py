@@ -39,23 +39,14 @@ class Reading:
 
 @dataclass(frozen=True)
 class Case:
-    """A stiff or extreme problem and how it is measured.
+    """A stiff or extreme problem and how it is measured."""
 
-    Attributes:
-        name: for tables and for choosing it.
-        what: one line.
-        measure: takes a device, yields readings.
-        group: splat, light, poison or training.
-        quick: takes less than a second on two cores.
-        note: what float32 cannot do better here, and what is done about it.
-    """
-
-    name: str
-    what: str
-    measure: Callable[[torch.device], Iterable[Reading]]
-    group: str = "splat"
-    quick: bool = True
-    note: str = ""
+    name: str  # For tables and for choosing it
+    what: str  # One line
+    measure: Callable[[torch.device], Iterable[Reading]]  # Takes a device, yields readings
+    group: str = "splat"  # Splat, light, poison or training
+    quick: bool = True  # Takes less than a second on two cores
+    note: str = ""  # What float32 cannot do better here, and what is done about it
 
 
 def _disturb(values: Tensor, generator: torch.Generator) -> Tensor:

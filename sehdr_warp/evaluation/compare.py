@@ -29,19 +29,12 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class ComparedRuns:
-    """Runs that differ by nothing but their seed: a row of a comparison.
+    """Runs that differ by nothing but their seed: a row of a comparison."""
 
-    Attributes:
-        label: name of the first run's folder.
-        scene: name of the scene.
-        figures: by column, one value for each run; None if the run has none.
-        curves: the lines of each run's metrics.jsonl.
-    """
-
-    label: str
-    scene: str
-    figures: dict[str, list[float | None]]
-    curves: list[list[dict[str, Any]]] = field(repr=False)
+    label: str  # Name of the first run's folder
+    scene: str  # Name of the scene
+    figures: dict[str, list[float | None]]  # By column, one value for each run; None if the run has none
+    curves: list[list[dict[str, Any]]] = field(repr=False)  # The lines of each run's metrics.jsonl
 
     @property
     def count(self) -> int:

@@ -27,27 +27,16 @@ TOLERANCE_PIXELS, TOLERANCE_RADII = 1.0, 0.35
 
 @dataclass(frozen=True, eq=False)
 class LightRegion:
-    """A connected bright region in one view.
+    """A connected bright region in one view."""
 
-    Attributes:
-        camera: of the view.
-        center: x and y, pixels.
-        area: pixels.
-        direction: unit vector from the camera to the center, in the scene's axes.
-        share: the part of its radiance that is rendered.
-        true_energy: sum of the true radiance over its pixels and MARGIN pixels around.
-        rendered_energy: the same of the render.
-        clipped: whether the photo shows most of its pixels as white.
-    """
-
-    camera: Camera
-    center: np.ndarray
-    area: int
-    direction: np.ndarray
-    share: float
-    true_energy: float
-    rendered_energy: float
-    clipped: bool
+    camera: Camera  # Of the view
+    center: np.ndarray  # x and y, pixels
+    area: int  # Pixels
+    direction: np.ndarray  # Unit vector from the camera to the center, in the scene's axes
+    share: float  # The part of its radiance that is rendered
+    true_energy: float  # Sum of the true radiance over its pixels and MARGIN pixels around
+    rendered_energy: float  # The same of the render
+    clipped: bool  # Whether the photo shows most of its pixels as white
 
 
 def light_regions(

@@ -16,19 +16,12 @@ LEAST_SIDE = 0.3  # Sine of the angle between a long Gaussian and the line to th
 
 @dataclass(frozen=True, eq=False)
 class LightShape:
-    """A rectangle or a sphere, in the scene's coordinates.
+    """A rectangle or a sphere, in the scene's coordinates."""
 
-    Attributes:
-        kind: "rect" or "sphere".
-        position: [3] middle.
-        axes: [3, 3] rows: along the width, along the height, and the direction that a rectangle emits to.
-        size: width and height of a rectangle; the diameter of a sphere, twice.
-    """
-
-    kind: str
-    position: np.ndarray
-    axes: np.ndarray
-    size: tuple[float, float]
+    kind: str  # "rect" or "sphere"
+    position: np.ndarray  # [3] middle
+    axes: np.ndarray  # [3, 3] rows: along the width, along the height, and the direction that a rectangle emits to
+    size: tuple[float, float]  # Width and height of a rectangle; the diameter of a sphere, twice
 
     def with_area(self, factor: float) -> "LightShape":
         """Return the shape with a multiple of its area; of a thin rectangle the width stays, up to a square."""

@@ -28,23 +28,14 @@ MAX_VIEWS = 200  # Training views that are compared, evenly chosen; more change 
 
 @dataclass(frozen=True)
 class Region:
-    """A connected region of a photo that the scene does not reproduce; positions are in pixels at the size of training.
+    """A connected region of a photo that the scene does not reproduce; positions: pixels at the size of training."""
 
-    Attributes:
-        photo: Name of the view.
-        column: Horizontal center.
-        row: Vertical center.
-        pixels: Area.
-        stops: Mean brightness of the photo above that of the scene; a bound if either is clipped or black.
-        box: Left, top, width and height of the bounding box.
-    """
-
-    photo: str
-    column: float
-    row: float
-    pixels: int
-    stops: float
-    box: tuple[int, int, int, int]
+    photo: str  # Name of the view
+    column: float  # Horizontal center
+    row: float  # Vertical center
+    pixels: int  # Area
+    stops: float  # Mean brightness of the photo above that of the scene; a bound if either is clipped or black
+    box: tuple[int, int, int, int]  # Left, top, width and height of the bounding box
 
 
 class PhotoComparison(NamedTuple):

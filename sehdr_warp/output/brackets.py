@@ -155,29 +155,17 @@ def remove_earlier(out: Path, names: Iterable[str]) -> None:
 
 @dataclass
 class BracketWriter:
-    """Writes the brackets of views one at a time, within open().
+    """Writes the brackets of views one at a time, within open()."""
 
-    Attributes:
-        out: Folder that the files belong to.
-        exposures: Ascending, as from bracket_exposures.
-        header: EXR attributes of the pictures.
-        pixel: "half" (float if half would overflow) or "float".
-        multipart: One EXR file with all exposures of a view.
-        ldr: One of LDR_FORMATS to add simulated photos through response.encode, or None.
-        response: Camera response for ldr.
-        group_by: "view" or "exposure": what one folder holds. Folders by exposure hold image sequences.
-        manifest_views: Entries of brackets.json so far.
-    """
-
-    out: Path
-    exposures: tuple[Exposure, ...]
-    header: PictureHeader
-    pixel: str = "half"
-    multipart: bool = False
-    ldr: str | None = None
-    response: Any = None
-    group_by: str = "view"
-    manifest_views: list[dict] = field(default_factory=list)
+    out: Path  # Folder that the files belong to
+    exposures: tuple[Exposure, ...]  # Ascending, as from bracket_exposures
+    header: PictureHeader  # EXR attributes of the pictures
+    pixel: str = "half"  # "half" (float if half would overflow) or "float"
+    multipart: bool = False  # One EXR file with all exposures of a view
+    ldr: str | None = None  # One of LDR_FORMATS to add simulated photos through response.encode, or None
+    response: Any = None  # Camera response for ldr
+    group_by: str = "view"  # "view" or "exposure": what one folder holds. Folders by exposure hold image sequences.
+    manifest_views: list[dict] = field(default_factory=list)  # Entries of brackets.json so far
 
     def __post_init__(self):
         """Raise SehdrError for options that contradict each other."""

@@ -33,23 +33,14 @@ REFERENCE_WHITE, PEAK = 203.0, 1000.0
 
 @dataclass(frozen=True)
 class Transfer:
-    """Encoding of light as codes.
+    """Encoding of light as codes."""
 
-    Attributes:
-        codec: Encoder of FFmpeg.
-        pixels: Pixel format of FFmpeg.
-        options: Options of the encoder.
-        primaries: Code point of ITU-T H.273, as are the next two.
-        curve: Transfer characteristics.
-        matrix: Matrix coefficients.
-    """
-
-    codec: str
-    pixels: str
-    options: dict[str, str]
-    primaries: int
-    curve: int
-    matrix: int
+    codec: str  # Encoder of FFmpeg
+    pixels: str  # Pixel format of FFmpeg
+    options: dict[str, str]  # Options of the encoder
+    primaries: int  # Code point of ITU-T H.273, as are the next two
+    curve: int  # Transfer characteristics
+    matrix: int  # Matrix coefficients
 
 
 _X265 = "log-level=error:repeat-headers=1"

@@ -18,21 +18,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PictureHeader:
-    """EXR attributes that all pictures of a render share.
+    """EXR attributes that all pictures of a render share."""
 
-    Attributes:
-        base_time: Seconds at 0 EV.
-        colorspace: Primaries of the EXR files.
-        captured: Local time that the files state as that of the picture.
-        provenance: Text by key.
-        luminance_of_one: cd/m^2 of a radiance of 1; None if it is not known.
-    """
-
-    base_time: float
-    colorspace: str = "rec709"
-    captured: datetime | None = None
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    luminance_of_one: float | None = None
+    base_time: float  # Seconds at 0 EV
+    colorspace: str = "rec709"  # Primaries of the EXR files
+    captured: datetime | None = None  # Local time that the files state as that of the picture
+    provenance: Mapping[str, str] = field(default_factory=dict)  # Text by key
+    luminance_of_one: float | None = None  # cd/m^2 of a radiance of 1; None if it is not known
 
     def __post_init__(self) -> None:
         """Raise SehdrError for an unknown color space."""

@@ -39,17 +39,11 @@ _WORST_ROLL = math.radians(12)  # Median roll about the common up above which th
 
 @dataclass(frozen=True)
 class WorldTransform:
-    """A similarity: y = scale * rotation @ x + translation, from a scene's coordinates to a file's.
+    """A similarity: y = scale * rotation @ x + translation, from a scene's coordinates to a file's."""
 
-    Attributes:
-        rotation: [3, 3] float64, proper.
-        translation: [3] float64.
-        scale: Positive factor; meters for each unit of the scene if it was set, else 1.
-    """
-
-    rotation: np.ndarray
-    translation: np.ndarray
-    scale: float = 1.0
+    rotation: np.ndarray  # [3, 3] float64, proper
+    translation: np.ndarray  # [3] float64
+    scale: float = 1.0  # Positive factor; meters for each unit of the scene if it was set, else 1
 
     @staticmethod
     def identity() -> "WorldTransform":

@@ -30,17 +30,11 @@ GradientsByTensor = Callable[[Tensor, Tensor | None], Sequence[Tensor]]
 
 
 class BlendResult(NamedTuple):
-    """A blended image and its backward pass, with no graph behind them.
+    """A blended image and its backward pass, with no graph behind them."""
 
-    Attributes:
-        image: [H, W, C].
-        transmittance: [H, W].
-        backward: their backward pass, for the tensors that with_gradient() gets.
-    """
-
-    image: Tensor
-    transmittance: Tensor
-    backward: GradientsByTensor
+    image: Tensor  # [H, W, C]
+    transmittance: Tensor  # [H, W]
+    backward: GradientsByTensor  # Their backward pass, for the tensors that with_gradient() gets
 
 
 def blend(

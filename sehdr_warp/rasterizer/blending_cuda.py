@@ -125,15 +125,10 @@ class BlockBackward:
 
 
 class FixedBackward(NamedTuple):
-    """A BlockBackward whose tensors stay where they are, but for the gradients.
+    """A BlockBackward whose tensors stay where they are, but for the gradients."""
 
-    Attributes:
-        fixed: its launch.
-        gradients: a tensor like the rows that BlockBackward returns.
-    """
-
-    fixed: FixedLaunch
-    gradients: Tensor
+    fixed: FixedLaunch  # Its launch
+    gradients: Tensor  # A tensor like the rows that BlockBackward returns
 
 
 def fixed_blend_blocks(

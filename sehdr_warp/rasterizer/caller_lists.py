@@ -22,19 +22,12 @@ MAX_PAIRS = 1 << 22  # Of Gaussians and pixels that contributions() looks at tog
 
 
 class CallerLists(NamedTuple):
-    """For each tile of the caller the Gaussians to draw there, front to back.
+    """For each tile of the caller the Gaussians to draw there, front to back."""
 
-    Attributes:
-        tile_size: edge of a tile in pixels.
-        starts: [rows, columns] int64, where each tile's list begins.
-        ends: [rows, columns] int64, where it ends.
-        gaussians: [M] int64, the lists.
-    """
-
-    tile_size: int
-    starts: Tensor
-    ends: Tensor
-    gaussians: Tensor
+    tile_size: int  # Edge of a tile in pixels
+    starts: Tensor  # [rows, columns] int64, where each tile's list begins
+    ends: Tensor  # [rows, columns] int64, where it ends
+    gaussians: Tensor  # [M] int64, the lists
 
 
 def blend_caller_lists(

@@ -37,21 +37,13 @@ class GaussiansAndCamera(NamedTuple):
 
 
 class ProjectedGaussians(NamedTuple):
-    """2D Gaussians of one camera. A culled Gaussian has extents 0 and no gradient.
+    """2D Gaussians of one camera. A culled Gaussian has extents 0 and no gradient."""
 
-    Attributes:
-        means2d: [N, 2] centers in pixels.
-        conics: [N, 3] a, b, c of the inverse covariance, in 1 / square pixels.
-        depths: [N] along the camera's axis, in scene units.
-        opacities: [N], lowered if antialiased.
-        extents: [N, 2] half-width and half-height in pixels within which alpha reaches the threshold.
-    """
-
-    means2d: Tensor
-    conics: Tensor
-    depths: Tensor
-    opacities: Tensor
-    extents: Tensor
+    means2d: Tensor  # [N, 2] centers in pixels
+    conics: Tensor  # [N, 3] a, b, c of the inverse covariance, in 1 / square pixels
+    depths: Tensor  # [N] along the camera's axis, in scene units
+    opacities: Tensor  # [N], lowered if antialiased
+    extents: Tensor  # [N, 2] half-width and half-height in pixels within which alpha reaches the threshold
 
 
 class Splats2D(NamedTuple):

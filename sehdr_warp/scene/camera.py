@@ -47,19 +47,12 @@ def whole_number(value: Any, name: str) -> int:
 
 
 class ProjectedPoints(NamedTuple):
-    """Pixels that points fall on.
+    """Pixels that points fall on."""
 
-    Attributes:
-        row: [P] float64 whole numbers, NaN behind the camera.
-        column: [P] likewise.
-        depth: [P] along the camera's axis, NaN behind the camera.
-        inside: [P] bool, whether the picture contains the point.
-    """
-
-    row: np.ndarray
-    column: np.ndarray
-    depth: np.ndarray
-    inside: np.ndarray
+    row: np.ndarray  # [P] float64 whole numbers, NaN behind the camera
+    column: np.ndarray  # [P] likewise
+    depth: np.ndarray  # [P] along the camera's axis, NaN behind the camera
+    inside: np.ndarray  # [P] bool, whether the picture contains the point
 
 
 @dataclass(frozen=True, repr=False)

@@ -90,15 +90,10 @@ UNPLACED = Lens("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5), Path("photos without ca
 
 
 class PointCloud(NamedTuple):
-    """Sparse points of a set.
+    """Sparse points of a set."""
 
-    Attributes:
-        positions: [P, 3] float64 world coordinates.
-        colors: [P, 3] float32 encoded values in [0, 1].
-    """
-
-    positions: np.ndarray
-    colors: np.ndarray
+    positions: np.ndarray  # [P, 3] float64 world coordinates
+    colors: np.ndarray  # [P, 3] float32 encoded values in [0, 1]
 
 
 NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))

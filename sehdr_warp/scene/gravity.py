@@ -46,17 +46,11 @@ _GPS_MISFIT = 0.04  # Largest distance (RMS) between GPS and cameras, of the mid
 
 
 class UpDirection(NamedTuple):
-    """A direction against gravity.
+    """A direction against gravity."""
 
-    Attributes:
-        direction: [3] unit vector in world coordinates.
-        source: "gps", "lines" or "cameras".
-        unit: Meters of a unit of the world, if GPS states it.
-    """
-
-    direction: np.ndarray
-    source: str
-    unit: float | None = None
+    direction: np.ndarray  # [3] unit vector in world coordinates
+    source: str  # "gps", "lines" or "cameras"
+    unit: float | None = None  # Meters of a unit of the world, if GPS states it
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""

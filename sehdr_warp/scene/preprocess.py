@@ -133,17 +133,11 @@ def _read_stored(
 
 @dataclass(frozen=True)
 class _Resampler:
-    """Undistorts and averages images from the size of a photo to that of its view.
+    """Undistorts and averages images from the size of a photo to that of its view."""
 
-    Attributes:
-        working: The photo's lens, at the size in which it is undistorted.
-        undistortion: Of that lens; None for a pinhole.
-        camera: Camera of the view.
-    """
-
-    working: Lens
-    undistortion: Undistortion | None
-    camera: Camera
+    working: Lens  # The photo's lens, at the size in which it is undistorted
+    undistortion: Undistortion | None  # Of that lens; None for a pinhole
+    camera: Camera  # Camera of the view
 
     def __call__(self, image: np.ndarray, values: Callable[[slice], np.ndarray | None] | None = None) -> np.ndarray:
         """Return [H, W] or [H, W, C] of the view's size; `values` as in area_average()."""

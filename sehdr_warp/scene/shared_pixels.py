@@ -25,17 +25,11 @@ _IN_FRONT = 0.2  # Part of the points that two cameras of the right direction se
 
 
 class SharedPixels(NamedTuple):
-    """Pixels that two photos share.
+    """Pixels that two photos share."""
 
-    Attributes:
-        indices: of the two photos.
-        lenses: of the two photos, at the sizes that are compared.
-        places: [k, 2] pixels in each photo.
-    """
-
-    indices: tuple[int, int]
-    lenses: tuple[Lens, Lens]
-    places: tuple[np.ndarray, np.ndarray]
+    indices: tuple[int, int]  # Of the two photos
+    lenses: tuple[Lens, Lens]  # Of the two photos, at the sizes that are compared
+    places: tuple[np.ndarray, np.ndarray]  # [k, 2] pixels in each photo
 
     def distance(self, lenses: Sequence[Lens], first: np.ndarray, second: np.ndarray) -> float:
         """Return the median distance of the pixels (Sampson's) from the epipolar lines of two world-to-camera poses.

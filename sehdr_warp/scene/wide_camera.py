@@ -173,19 +173,12 @@ def faces_of(view: View, size: int | None = None) -> list[View]:
 
 
 class Face(NamedTuple):
-    """A pinhole camera that shows a part of a wide one.
+    """A pinhole camera that shows a part of a wide one."""
 
-    Attributes:
-        number: Of its rotation in face_rotations().
-        camera: The pinhole camera, FACE_ANGLE degrees wide.
-        places: [S, S, 2] rows and columns of the wide picture, the first center (0, 0); NaN outside of it.
-        visible: [S, S] bool, whether the wide picture shows a pixel.
-    """
-
-    number: int
-    camera: Camera
-    places: np.ndarray
-    visible: np.ndarray
+    number: int  # Of its rotation in face_rotations()
+    camera: Camera  # The pinhole camera, FACE_ANGLE degrees wide
+    places: np.ndarray  # [S, S, 2] rows and columns of the wide picture, the first center (0, 0); NaN outside of it
+    visible: np.ndarray  # [S, S] bool, whether the wide picture shows a pixel
 
 
 def face_cameras(camera: Camera, size: int | None = None) -> list[Face]:

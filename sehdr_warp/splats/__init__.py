@@ -29,19 +29,12 @@ USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 
 
 class Format(NamedTuple):
-    """Reader, writer and properties of a kind of file.
+    """Reader, writer and properties of a kind of file."""
 
-    Attributes:
-        read: Return the Gaussians of a file.
-        write: Write Gaussians to a file; the last argument is `overwrite`.
-        color_model: The one color model that the file can hold; None if it can hold any.
-        is_lossy: Whether the file holds rounded numbers, which take a tenth to a fourth of the space.
-    """
-
-    read: Callable[[Path], GaussianArrays]
-    write: Callable[[Path, GaussianArrays, bool], object]
-    color_model: str | None
-    is_lossy: bool = False
+    read: Callable[[Path], GaussianArrays]  # Return the Gaussians of a file
+    write: Callable[[Path, GaussianArrays, bool], object]  # Write Gaussians to a file; the last argument is `overwrite`
+    color_model: str | None  # The one color model that the file can hold; None if it can hold any
+    is_lossy: bool = False  # Whether the file holds rounded numbers, which take a tenth to a fourth of the space
 
 
 FORMATS = {

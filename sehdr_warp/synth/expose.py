@@ -46,19 +46,12 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class RadianceView:
-    """A view of HDR truth.
+    """A view of HDR truth."""
 
-    Attributes:
-        name: the view's stem (`r_0`).
-        camera: its camera.
-        radiance: [H, W, 3] scene-linear, at least 0.
-        split: "train" or "test".
-    """
-
-    name: str
-    camera: Camera
-    radiance: np.ndarray
-    split: str
+    name: str  # The view's stem (`r_0`)
+    camera: Camera  # Its camera
+    radiance: np.ndarray  # [H, W, 3] scene-linear, at least 0
+    split: str  # "train" or "test"
 
 
 def expose(

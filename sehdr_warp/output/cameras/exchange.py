@@ -53,17 +53,11 @@ _CAMERA = """    def Camera "{name}"
 
 
 class CameraPath(NamedTuple):
-    """A moving camera.
+    """A moving camera."""
 
-    Attributes:
-        name: Of the camera.
-        frames: Frame numbers, ascending.
-        cameras: One for each frame.
-    """
-
-    name: str
-    frames: list[int]
-    cameras: list[Camera]
+    name: str  # Of the camera
+    frames: list[int]  # Frame numbers, ascending
+    cameras: list[Camera]  # One for each frame
 
 
 def camera_path(views: Sequence[tuple[str, Camera]]) -> CameraPath | None:

@@ -56,17 +56,11 @@ _CLOSE = 0.03  # Relative difference of depth that counts as agreement
 
 @dataclass(frozen=True)
 class Ground:
-    """A floor: the lowest large level part of a mesh, in upright coordinates.
+    """A floor: the lowest large level part of a mesh, in upright coordinates."""
 
-    Attributes:
-        height: Of the plane where x and z are 0.
-        normal: [3] unit vector, upwards.
-        share: Share of the mesh's area.
-    """
-
-    height: float
-    normal: np.ndarray
-    share: float
+    height: float  # Of the plane where x and z are 0
+    normal: np.ndarray  # [3] unit vector, upwards
+    share: float  # Share of the mesh's area
 
     @property
     def tilt(self) -> float:
@@ -81,21 +75,13 @@ class Ground:
 
 @dataclass(frozen=True)
 class ProxyMesh:
-    """A triangle mesh in the coordinates of a file.
+    """A triangle mesh in the coordinates of a file."""
 
-    Attributes:
-        vertices: [V, 3] float32.
-        faces: [F, 3] int32, counterclockwise as seen from outside.
-        radiance: [V, 3] float32, scene-linear Rec.709.
-        voxel: Longest side of a voxel.
-        ground: The floor, if one was found.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    radiance: np.ndarray
-    voxel: float
-    ground: Ground | None = None
+    vertices: np.ndarray  # [V, 3] float32
+    faces: np.ndarray  # [F, 3] int32, counterclockwise as seen from outside
+    radiance: np.ndarray  # [V, 3] float32, scene-linear Rec.709
+    voxel: float  # Longest side of a voxel
+    ground: Ground | None = None  # The floor, if one was found
 
 
 def write_proxy_mesh(

@@ -10,17 +10,11 @@ from ...scene.color.primaries import REC709
 
 
 class ColorSpace(NamedTuple):
-    """A linear RGB space.
+    """A linear RGB space."""
 
-    Attributes:
-        name: On the command line.
-        dataset: Key in colour.RGB_COLOURSPACES.
-        interop_id: `colorInteropID` of OpenEXR (Color Interop Forum), if the space has one.
-    """
-
-    name: str
-    dataset: str
-    interop_id: str | None
+    name: str  # On the command line
+    dataset: str  # Key in colour.RGB_COLOURSPACES
+    interop_id: str | None  # `colorInteropID` of OpenEXR (Color Interop Forum), if the space has one
 
 
 SPACES = (

@@ -27,17 +27,11 @@ _FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class Part:
-    """One picture of a file.
+    """One picture of a file."""
 
-    Attributes:
-        channels: Name -> [H, W] finite numbers, all of one shape: R, G, B, A, Z, and any other.
-        header: Attributes such as exr_header() returns.
-        name: Unique in the file; may be empty if the file has one part.
-    """
-
-    channels: Mapping[str, np.ndarray]
-    header: Mapping[str, Any] = field(default_factory=dict)
-    name: str = ""
+    channels: Mapping[str, np.ndarray]  # Name -> [H, W] finite numbers, all of one shape: R, G, B, A, Z, and any other
+    header: Mapping[str, Any] = field(default_factory=dict)  # Attributes such as exr_header() returns
+    name: str = ""  # Unique in the file; may be empty if the file has one part
 
 
 def exr_header(

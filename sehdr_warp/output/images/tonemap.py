@@ -22,15 +22,10 @@ _LOW, _HIGH, _WHITE = 1.0, 99.0, 99.8
 
 @dataclass(frozen=True)
 class ToneMap:
-    """Reinhard's operator with fixed parameters.
+    """Reinhard's operator with fixed parameters."""
 
-    Attributes:
-        scale: Factor on radiance that brings the scene's log-average to its key.
-        white: Least scaled luminance that is shown as white.
-    """
-
-    scale: float
-    white: float
+    scale: float  # Factor on radiance that brings the scene's log-average to its key
+    white: float  # Least scaled luminance that is shown as white
 
     def __call__(self, radiance: np.ndarray) -> np.ndarray:
         """Convert [..., 3] linear Rec.709 radiance to sRGB-encoded float32 in [0, 1]; negative radiance counts as 0."""

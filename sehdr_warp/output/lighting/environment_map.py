@@ -188,23 +188,14 @@ def check_map(path: Path, size: int, layout: str, axes: str, beyond: float | Non
 
 @dataclass(frozen=True, eq=False)
 class RenderedMap:
-    """The pixels of an environment map.
+    """The pixels of an environment map."""
 
-    Attributes:
-        hdr: [H, W, 3] radiance.
-        alpha: [H, W] coverage.
-        distance: [H, W] mean distance of what is seen, 0 where nothing is.
-        confidence: [H, W] mean of what is seen; None if it was not measured.
-        clipped: [H, W] share of clipped light; None without shares.
-        certain: [H, W] clipped light up to the photos' white, mean of channels; None without shares.
-    """
-
-    hdr: np.ndarray
-    alpha: np.ndarray
-    distance: np.ndarray
-    confidence: np.ndarray | None
-    clipped: np.ndarray | None
-    certain: np.ndarray | None
+    hdr: np.ndarray  # [H, W, 3] radiance
+    alpha: np.ndarray  # [H, W] coverage
+    distance: np.ndarray  # [H, W] mean distance of what is seen, 0 where nothing is
+    confidence: np.ndarray | None  # [H, W] mean of what is seen; None if it was not measured
+    clipped: np.ndarray | None  # [H, W] share of clipped light; None without shares
+    certain: np.ndarray | None  # [H, W] clipped light up to the photos' white, mean of channels; None without shares
 
 
 def render_map(

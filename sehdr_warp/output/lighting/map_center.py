@@ -20,15 +20,10 @@ _FACING, _SIDES, _CLEARANCE = 0.7, 0.5, 0.5
 
 
 class MapCenter(NamedTuple):
-    """Position from which a map of a whole scene is rendered, and what is left out of it.
+    """Position from which a map of a whole scene is rendered, and what is left out of it."""
 
-    Attributes:
-        position: [3], scene coordinates.
-        beyond: Distance within which Gaussians are left out, scene units; 0 leaves out none.
-    """
-
-    position: np.ndarray
-    beyond: float
+    position: np.ndarray  # [3], scene coordinates
+    beyond: float  # Distance within which Gaussians are left out, scene units; 0 leaves out none
 
 
 def map_center(photos: list[Camera]) -> MapCenter:

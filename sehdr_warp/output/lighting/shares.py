@@ -7,21 +7,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class LightShares:
-    """Parts of the light that reaches a point from all directions; they add up to 1 if there is light.
+    """Parts of the light that reaches a point from all directions; they add up to 1 if there is light."""
 
-    Attributes:
-        measured: shown by photos below their white.
-        bound: of clipped light, what reaches up to the photos' white: at least so much is there.
-        estimated: of clipped light, what the scene holds above the photos' white.
-        inpainted: directions that no photo shows.
-        clipped_known: False if the scene does not state what clipped; then measured holds the first three.
-    """
-
-    measured: float
-    bound: float
-    estimated: float
-    inpainted: float
-    clipped_known: bool
+    measured: float  # Shown by photos below their white
+    bound: float  # Of clipped light, what reaches up to the photos' white: at least so much is there
+    estimated: float  # Of clipped light, what the scene holds above the photos' white
+    inpainted: float  # Directions that no photo shows
+    clipped_known: bool  # False if the scene does not state what clipped; then measured holds the first three
 
     def to_dict(self) -> dict[str, float | bool | None]:
         """Return plain values; None for what is not known, and then `shown` for what photos or the file show."""

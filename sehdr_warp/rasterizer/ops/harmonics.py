@@ -80,18 +80,12 @@ class HarmonicsGradients:
     The gradients are sums over the views. In a training on a GPU, RadianceField.render_train_view() hooks grad_colors,
     FlatGradients joins the ranks' views, and Adam.step() multiplies the factors out in its kernel
     (harmonics_adam_step), so that the gradients of the coefficients are never stored.
-
-    Attributes:
-        grad_colors: [V, N, 3] gradients with respect to the values of each view.
-        positions: [V, 3] of the views' cameras, world coordinates.
-        means: [N, 3] of the Gaussians when the views were rendered.
-        degree: of the evaluation.
     """
 
-    grad_colors: Tensor
-    positions: Tensor
-    means: Tensor
-    degree: int
+    grad_colors: Tensor  # [V, N, 3] gradients with respect to the values of each view
+    positions: Tensor  # [V, 3] of the views' cameras, world coordinates
+    means: Tensor  # [N, 3] of the Gaussians when the views were rendered
+    degree: int  # Of the evaluation
 
     @cached_property
     def basis(self) -> Tensor:

@@ -87,15 +87,10 @@ def scale_rows(values: Sequence[Tensor], which: Tensor, factor: float) -> None:
 
 
 class SampledRows(NamedTuple):
-    """Rows sampled by weights.
+    """Rows sampled by weights."""
 
-    Attributes:
-        rows: [K] int64.
-        total: float64 scalar, of the weights; if it is 0, nothing counts as sampled.
-    """
-
-    rows: Tensor
-    total: Tensor
+    rows: Tensor  # [K] int64
+    total: Tensor  # float64 scalar, of the weights; if it is 0, nothing counts as sampled
 
 
 def _rows(tensors: Sequence[Tensor]) -> list[Tensor]:

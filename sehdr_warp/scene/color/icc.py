@@ -29,23 +29,14 @@ _SAMPLES = 65_536  # Of a curve that a formula describes: exact at all codes of 
 
 @dataclass(frozen=True, eq=False)
 class IccTable:
-    """The way from a device's codes to the profile connection space. Stages that a profile lacks are None.
+    """The way from a device's codes to the profile connection space. Stages that a profile lacks are None."""
 
-    Attributes:
-        device_curves: samples of a curve for each channel, even in codes from 0 to 1.
-        entries: [r, g, b, 3] values of the table.
-        middle_curves: applied to what the table returns.
-        matrix: [3, 4] factors and offsets, applied after these.
-        output_curves: applied last.
-        space: "XYZ", "Lab", or "Lab 16" for the older encoding of CIELAB in 16 bits.
-    """
-
-    device_curves: tuple[np.ndarray, ...] | None
-    entries: np.ndarray | None
-    middle_curves: tuple[np.ndarray, ...] | None
-    matrix: np.ndarray | None
-    output_curves: tuple[np.ndarray, ...] | None
-    space: str
+    device_curves: tuple[np.ndarray, ...] | None  # Samples of a curve for each channel, even in codes from 0 to 1
+    entries: np.ndarray | None  # [r, g, b, 3] values of the table
+    middle_curves: tuple[np.ndarray, ...] | None  # Applied to what the table returns
+    matrix: np.ndarray | None  # [3, 4] factors and offsets, applied after these
+    output_curves: tuple[np.ndarray, ...] | None  # Applied last
+    space: str  # "XYZ", "Lab", or "Lab 16" for the older encoding of CIELAB in 16 bits
 
     def to_xyz(self, codes: np.ndarray) -> np.ndarray:
         """Return CIE XYZ relative to D50 [..., 3], Y 1 at the medium's white, of codes [..., 3] in [0, 1]."""

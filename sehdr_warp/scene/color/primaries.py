@@ -49,15 +49,10 @@ def matrix_to_rec709(chromaticities: tuple[float, ...]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class InteropEncoding:
-    """Colors that a colorInteropID of OpenEXR (Color Interop Forum) states.
+    """Colors that a colorInteropID of OpenEXR (Color Interop Forum) states."""
 
-    Attributes:
-        chromaticities: CIE xy of red, green, blue and white; None if the ID is not known.
-        curve: of its values: "lin", "srgb", "g18", "g22" or "g24".
-    """
-
-    chromaticities: tuple[float, ...] | None
-    curve: str = "lin"
+    chromaticities: tuple[float, ...] | None  # CIE xy of red, green, blue and white; None if the ID is not known
+    curve: str = "lin"  # Of its values: "lin", "srgb", "g18", "g22" or "g24"
 
     def decode(self, values: np.ndarray) -> np.ndarray:
         """Return linear values."""

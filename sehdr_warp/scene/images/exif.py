@@ -36,19 +36,12 @@ _IN_XMP = {
 
 
 class ExifExposure(NamedTuple):
-    """Exposure that EXIF states.
+    """Exposure that EXIF states."""
 
-    Attributes:
-        time: seconds.
-        iso: ISO speed.
-        f_number: focal length over aperture.
-        flash: it fired.
-    """
-
-    time: float | None = None
-    iso: float | None = None
-    f_number: float | None = None
-    flash: bool = False
+    time: float | None = None  # Seconds
+    iso: float | None = None  # ISO speed
+    f_number: float | None = None  # Focal length over aperture
+    flash: bool = False  # It fired
 
 
 def exif_exposure(path: Path) -> ExifExposure:

@@ -28,25 +28,15 @@ _REMEDY = "develop the photos as JPEG, PNG or TIFF, or convert them to DNG"
 
 
 class RawHeader(NamedTuple):
-    """Statements of a RAW file beside its pixels; None for an exposure that it does not state.
+    """Statements of a RAW file beside its pixels; None for an exposure that it does not state."""
 
-    Attributes:
-        size: (width, height) of the developed photo as the sensor lies.
-        upright_size: of the photo turned upright.
-        exposure_time: seconds.
-        iso: ISO speed.
-        f_number: focal length over aperture.
-        matrix: [3, 3] from the sensor's white-balanced colors to linear Rec.709; zero without it.
-        balance: factors of red, green and blue on the sensor's colors; empty without them.
-    """
-
-    size: tuple[int, int]
-    upright_size: tuple[int, int]
-    exposure_time: float | None
-    iso: float | None
-    f_number: float | None
-    matrix: np.ndarray
-    balance: tuple[float, ...]
+    size: tuple[int, int]  # (width, height) of the developed photo as the sensor lies
+    upright_size: tuple[int, int]  # Of the photo turned upright
+    exposure_time: float | None  # Seconds
+    iso: float | None  # ISO speed
+    f_number: float | None  # Focal length over aperture
+    matrix: np.ndarray  # [3, 3] from the sensor's white-balanced colors to linear Rec.709; zero without it
+    balance: tuple[float, ...]  # Factors of red, green and blue on the sensor's colors; empty without them
 
 
 def read_header(path: Path) -> RawHeader:

@@ -43,17 +43,11 @@ _MAX_REPEAT = 64
 
 @dataclass(frozen=True)
 class JpegTiles:
-    """Baseline JPEG pictures that a lossy DNG's linear raw image consists of, row by row.
+    """Baseline JPEG pictures that a lossy DNG's linear raw image consists of, row by row."""
 
-    Attributes:
-        size: (width, height) of each; the last ones may reach beyond the image, or end with it.
-        places: (offset in the file, length) of each.
-        linearization: stored value of each code; None if codes are stored values.
-    """
-
-    size: tuple[int, int]
-    places: tuple[tuple[int, int], ...]
-    linearization: np.ndarray | None
+    size: tuple[int, int]  # (width, height) of each; the last ones may reach beyond the image, or end with it
+    places: tuple[tuple[int, int], ...]  # (offset in the file, length) of each
+    linearization: np.ndarray | None  # Stored value of each code; None if codes are stored values
 
 
 @dataclass(frozen=True)

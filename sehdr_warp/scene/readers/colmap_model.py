@@ -30,32 +30,20 @@ _KINDS = ((".bin", ".bin"), (".txt", ".txt"), (".bin", ".txt"), (".txt", ".bin")
 
 @dataclass(frozen=True)
 class ModelImage:
-    """A registered image.
+    """A registered image."""
 
-    Attributes:
-        name: as stored, not yet trusted as a path.
-        lens: intrinsics.
-        world_to_camera: [4, 4].
-    """
-
-    name: str
-    lens: Lens
-    world_to_camera: np.ndarray
+    name: str  # As stored, not yet trusted as a path
+    lens: Lens  # Intrinsics
+    world_to_camera: np.ndarray  # [4, 4]
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """A reconstruction.
+    """A reconstruction."""
 
-    Attributes:
-        images: in the file's order.
-        cloud: its points.
-        unusable: errors of images whose poses cannot be, and which are not in `images`.
-    """
-
-    images: tuple[ModelImage, ...]
-    cloud: PointCloud
-    unusable: tuple[InputError, ...] = ()
+    images: tuple[ModelImage, ...]  # In the file's order
+    cloud: PointCloud  # Its points
+    unusable: tuple[InputError, ...] = ()  # Errors of images whose poses cannot be, and which are not in `images`
 
 
 def find_model(folder: Path, *, anywhere: bool = False) -> Path | None:

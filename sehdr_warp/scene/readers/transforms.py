@@ -81,25 +81,15 @@ def read_transforms(folder: Path, file: Path | None = None) -> DataparserOutputs
 
 @dataclass
 class _Frames:
-    """Frames of transforms.json.
+    """Frames of transforms.json."""
 
-    Attributes:
-        records: of the frames that can be used.
-        absent: names of frames without a photo.
-        photos: by the names of the frames, None for one without.
-        unusable: errors of poses, whose frames are left out.
-        untimed: errors of exposure times, which are left out.
-        unread: fields of _UNREAD that the files state.
-        varying: values of the fields of _VARYING.
-    """
-
-    records: list[ImageRecord] = field(default_factory=list)
-    absent: list[str] = field(default_factory=list)
-    photos: dict[str, Path | None] = field(default_factory=dict)
-    unusable: list[InputError] = field(default_factory=list)
-    untimed: list[InputError] = field(default_factory=list)
-    unread: set[str] = field(default_factory=set)
-    varying: dict[str, set[str]] = field(default_factory=dict)
+    records: list[ImageRecord] = field(default_factory=list)  # Of the frames that can be used
+    absent: list[str] = field(default_factory=list)  # Names of frames without a photo
+    photos: dict[str, Path | None] = field(default_factory=dict)  # By the names of the frames, None for one without
+    unusable: list[InputError] = field(default_factory=list)  # Errors of poses, whose frames are left out
+    untimed: list[InputError] = field(default_factory=list)  # Errors of exposure times, which are left out
+    unread: set[str] = field(default_factory=set)  # Fields of _UNREAD that the files state
+    varying: dict[str, set[str]] = field(default_factory=dict)  # Values of the fields of _VARYING
 
     def add_file(self, folder: Path, path: Path, values: dict, split: str | None) -> None:
         """Add the frames of a file; `split` is that of all of them, None if the file states it by frame."""

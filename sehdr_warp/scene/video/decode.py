@@ -38,23 +38,14 @@ _OPTIONS = {"format_whitelist": _DEMUXERS, "protocol_whitelist": "file"}
 
 @dataclass(frozen=True)
 class Clip:
-    """A video file that was opened once.
+    """A video file that was opened once."""
 
-    Attributes:
-        path: the file.
-        size: (width, height) of a frame, upright, in square pixels.
-        seconds: its length as the file states it; 0 if it does not.
-        color: what the stream states.
-        interlaced: whether even and odd rows of a frame are of two moments.
-        anamorphic: whether the stored pixels are not square.
-    """
-
-    path: Path
-    size: tuple[int, int]
-    seconds: float
-    color: VideoColor
-    interlaced: bool = False
-    anamorphic: bool = False
+    path: Path  # The file
+    size: tuple[int, int]  # (width, height) of a frame, upright, in square pixels
+    seconds: float  # Its length as the file states it; 0 if it does not
+    color: VideoColor  # What the stream states
+    interlaced: bool = False  # Whether even and odd rows of a frame are of two moments
+    anamorphic: bool = False  # Whether the stored pixels are not square
 
 
 def is_video(path: Path) -> bool:
@@ -242,15 +233,10 @@ def _chroma_places(frame: Any, layout: str) -> tuple[float, float]:
 
 
 class _Orientation(NamedTuple):
-    """Way of a stored frame to an upright one.
+    """Way of a stored frame to an upright one."""
 
-    Attributes:
-        turns: quarter turns counterclockwise.
-        mirrored: whether it is mirrored left to right before that, as by front cameras.
-    """
-
-    turns: int
-    mirrored: bool
+    turns: int  # Quarter turns counterclockwise
+    mirrored: bool  # Whether it is mirrored left to right before that, as by front cameras
 
 
 def _orientation(frame: Any) -> _Orientation:

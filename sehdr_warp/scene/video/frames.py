@@ -35,17 +35,11 @@ _SHARPNESS_WIDTH, _MOVEMENT_WIDTH = 640, 192
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """Frames of a clip that are used.
+    """Frames of a clip that are used."""
 
-    Attributes:
-        numbers: of the chosen frames, in order.
-        total: frames that were decoded.
-        movement: of the whole clip, in widths of the picture.
-    """
-
-    numbers: tuple[int, ...]
-    total: int
-    movement: float
+    numbers: tuple[int, ...]  # Of the chosen frames, in order
+    total: int  # Frames that were decoded
+    movement: float  # Of the whole clip, in widths of the picture
 
 
 def choose_frames(clip: Clip) -> FrameChoice:
