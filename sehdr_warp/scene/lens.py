@@ -142,6 +142,7 @@ class Undistortion:
 
     Attributes:
         inside: [H, W] bool, True where the lens imaged something; None if it did everywhere.
+        share: part of the photos' area that is left; more than half for lenses that exist.
     """
 
     def __init__(self, lens: Lens):
@@ -171,6 +172,7 @@ class Undistortion:
         inside = np.asarray((np.isfinite(places) & (places >= 0) & (places <= (lens.width, lens.height))).all(axis=2))
         if not inside.any():
             raise InputError(lens.source, f"{described} leaves no pixel of the image", "correct its parameters")
+        self.share = float(np.prod(np.ptp(places[inside], axis=0) / (lens.width, lens.height)))
         # From COLMAP's pixel centers at 0.5 to array indices; coordinates as (row, column).
         self._places = np.where(inside, places.transpose(2, 0, 1)[::-1] - 0.5, 0).astype(np.float32)
         self.inside: np.ndarray | None = None if inside.all() else inside

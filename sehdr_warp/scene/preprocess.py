@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("sehdr_warp.scene")
 _LEAST_CLIPPED = 0.05  # Part of a pixel's area that may be clipped for its light above white to be known
+_LEAST_SHARE = 0.5  # Part of a photo's area that undistortion leaves of lenses that exist
 _PIXELS_AT_ONCE = 64_000_000  # Pixels of the photos that are read in parallel, which bounds memory
 
 
@@ -86,12 +87,24 @@ def preprocess(
         meaning = "are left out" if dataset.alpha == "mask" else "count as black light"
         count = f"{len(preprocessor.transparent)} of {len(names)} photos"
         masks.append(f"transparency: {count} have transparent pixels, which {meaning}")
+    masks += _cropped_note(preprocessor.cropped, dataset)
     masks += gain_map_notes(preprocessor.gain_map_problems)
     masks += unused_bits_note(preprocessor.largest_code, linear=dataset.kind == "linear")
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
     times_known = dataset.times_known
     return Scene(dataset.name, dataset.format, tuple(views), points, colors, times_known, notes, response=response)
+
+
+def _cropped_note(cropped: Mapping[Path, float], dataset: DataparserOutputs) -> list[str]:
+    """Return a note on photos of which undistortion leaves too little, by the part of their area that it leaves."""
+    if not cropped:
+        return []
+    record = next(record for record in dataset.records if record.image in cropped)
+    count, share = f"{len(cropped)} of {len(dataset.records)} photos", max(cropped.values())
+    problem = f"lens: undistorted, {count} show at most {share:.0%} of their area, because the distortion that"
+    problem += f" {record.lens.source.name} states bends the rest back, as no lens does"
+    return [f"{problem}; to find the cameras anew, give a folder with the photos alone"]
 
 
 def read_codes(record: ImageRecord) -> EncodedImage:
@@ -159,6 +172,7 @@ class _Preprocessor:
         self._last: tuple[Lens, Undistortion] | None = None
         self.mask_shares: dict[str, float | None] = {}  # By view: the mean of its mask file
         self.labeled_masks: set[Path] = set()
+        self.cropped: dict[Path, float] = {}  # Photos of which undistortion leaves too little: the part of their area
         self.transparent: set[str] = set()  # Views whose photos have transparent pixels
         self.largest_code = 0  # Of photos with 16 bits
         self.unusable_truth: list[InputError] = []
@@ -237,6 +251,8 @@ class _Preprocessor:
             if self._last is None or self._last[0] != lens:
                 self._last = lens, Undistortion(lens)
             undistortion = self._last[1]
+        if undistortion.share < _LEAST_SHARE:
+            self.cropped[record.image] = undistortion.share
         return _Resampler(lens, undistortion, undistortion.camera(record.world_to_camera).within(self.max_size))
 
     def _resampled(

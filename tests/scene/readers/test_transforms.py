@@ -97,6 +97,15 @@ def test_distortion_by_camera_model(tmp_path, fields, model, bent):
     assert lens.model == model and lens.params[4:] == pytest.approx(bent)
 
 
+def test_a_lens_that_leaves_little_of_the_photos_is_named(tmp_path):
+    """A calibration of too few photos: its radial terms bend the picture back near the middle."""
+    write_blender(tmp_path, 6, size=(150, 200), fl_x=343.0, fl_y=975.0, k1=46.6, k2=-3690.0)
+    note = "lens: undistorted, 6 of 6 photos show at most "
+    assert sum(line.startswith(note) and "transforms.json" in line for line in load(tmp_path).notes) == 1
+    _edit(tmp_path, k1=-0.3, k2=0.1)
+    assert not any(line.startswith(note) for line in load(tmp_path).notes)
+
+
 @pytest.mark.parametrize("name", ["k4", "k5", "k6"])
 def test_distortion_whose_meaning_is_open_is_refused(tmp_path, name):
     write_blender(tmp_path, **{"k1": 0.1, name: 0.2})
