@@ -175,11 +175,7 @@ class Splats(RenderableScene):
     """
 
     def __init__(
-        self,
-        path: Path,
-        field: RadianceField,
-        cameras: tuple[CameraEntry, ...],
-        world_matrix: np.ndarray | None = None,
+        self, path: Path, field: RadianceField, cameras: tuple[CameraEntry, ...], world_matrix: np.ndarray | None = None
     ):
         """Wrap a field; load_splats() reads files."""
         self.path, self.field, self.cameras, self.world_matrix = path, field, cameras, world_matrix

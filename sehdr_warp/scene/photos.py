@@ -19,15 +19,7 @@ from .file_names import MASK_FOLDERS
 from .float_photos import tone_mapped
 from .images.hdr_files import hdr_size, pixel_aspect
 from .images.heif import avif_bits
-from .images.ldr_files import (
-    EncodedImage,
-    file_kind,
-    image_sizes,
-    open_image,
-    orientation_of,
-    read_ldr,
-    require_file,
-)
+from .images.ldr_files import EncodedImage, file_kind, image_sizes, open_image, orientation_of, read_ldr, require_file
 from .lens import Lens
 from .raw.decode import read_header, read_raw
 

@@ -160,12 +160,7 @@ def start_points(
 
 
 def match_points(
-    scene: Scene,
-    count: int,
-    *,
-    response: Response | None = None,
-    device: torch.device | str = "cpu",
-    seed: int = 0,
+    scene: Scene, count: int, *, response: Response | None = None, device: torch.device | str = "cpu", seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find points of the surfaces that the training photos show.
 

@@ -218,11 +218,7 @@ def _light(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
         unneeded: dict[str, object] = (
             {} if facts.clipped else dict.fromkeys(("loss.clipped_smoothness", "loss.clipped_estimate"), 0.0)
         )
-        return Decision(
-            unneeded,
-            "from the photos",
-            f"{facts.clipped:.1%} of the pixels are clipped",
-        )
+        return Decision(unneeded, "from the photos", f"{facts.clipped:.1%} of the pixels are clipped")
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
     reason = f"{facts.truths} float pictures have any brightness: on a photo's curve, errors of highlights count little"
     return Decision(fields, "in the mu-law", reason)

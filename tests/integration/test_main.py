@@ -9,10 +9,7 @@ pages = int(open('/proc/self/statm').read().split()[0])
 resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (1 << 20),) * 2)
 raise SystemError('returned NULL without setting an exception')
 """
-CAUSES = {
-    "no memory": "raise MemoryError",
-    "anything without address space": LIMIT,
-}
+CAUSES = {"no memory": "raise MemoryError", "anything without address space": LIMIT}
 
 
 def ended(code: str) -> subprocess.CompletedProcess:

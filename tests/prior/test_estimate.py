@@ -9,13 +9,7 @@ from safetensors.torch import save_file
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.prior import LightPrior, coarse_size, combined_estimates, load_prior
-from sehdr_warp.prior.estimate import (
-    ESTIMATE_DEVIATION,
-    LARGE_DEVIATION_POWER,
-    VARIANCE_SHARE,
-    WEIGHTS,
-    LightEstimate,
-)
+from sehdr_warp.prior.estimate import ESTIMATE_DEVIATION, LARGE_DEVIATION_POWER, VARIANCE_SHARE, WEIGHTS, LightEstimate
 from sehdr_warp.prior.network import LightNetwork
 
 

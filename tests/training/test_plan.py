@@ -13,14 +13,7 @@ from sehdr_warp.runs.config import ScheduleConfig
 from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import Camera, codes_of
-from sehdr_warp.training.plan import (
-    RULES,
-    SCALED_RATES,
-    UNMEASURED,
-    Decision,
-    cpu_step_seconds,
-    make_plan,
-)
+from sehdr_warp.training.plan import RULES, SCALED_RATES, UNMEASURED, Decision, cpu_step_seconds, make_plan
 from sehdr_warp.training.scene_facts import measure_scene
 from sehdr_warp.training.strategies import mcmc_cap
 from sehdr_warp.training.train import create_trainer, train

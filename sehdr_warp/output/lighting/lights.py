@@ -21,15 +21,7 @@ from ..images.display import exposure_for_white
 from ..images.exr import rgb_channels, write_exr
 from ..picture_header import provenance
 from ..world_transform import WorldTransform, world_transform
-from .environment_map import (
-    COVERED,
-    inpainted_light,
-    latlong,
-    little_visible,
-    map_header,
-    render_map,
-    solid_angles,
-)
+from .environment_map import COVERED, inpainted_light, latlong, little_visible, map_header, render_map, solid_angles
 from .map_center import MapCenter, find_center
 from .unit import luminance_of_one
 

@@ -7,14 +7,7 @@ import torch
 from torch import Tensor
 
 from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, moments_of
-from ...rasterizer.ops.relocation import (
-    SampledRows,
-    copy_rows,
-    count_copies,
-    number_slots,
-    scale_rows,
-    share_opacities,
-)
+from ...rasterizer.ops.relocation import SampledRows, copy_rows, count_copies, number_slots, scale_rows, share_opacities
 from ...rasterizer.ops.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
 from .base import SEED_STRIDE, MakeSeeds, Strategy
