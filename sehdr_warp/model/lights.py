@@ -67,17 +67,11 @@ def light_name(index: int) -> str:
 
 
 class ReceivedLight(NamedTuple):
-    """Light that a camera or a point receives of each Gaussian.
+    """Light that a camera or a point receives of each Gaussian."""
 
-    Attributes:
-        pixels: [N] sums of its blending weights over the pixels.
-        angles: [N] solid angle that nothing hides, steradians.
-        light: [N, 3] radiance times this angle.
-    """
-
-    pixels: Tensor
-    angles: Tensor
-    light: Tensor
+    pixels: Tensor  # [N] sums of its blending weights over the pixels
+    angles: Tensor  # [N] solid angle that nothing hides, steradians
+    light: Tensor  # [N, 3] radiance times this angle
 
 
 @torch.no_grad()
@@ -119,7 +113,7 @@ def find_lights(
     """
     if not views:
         return []
-    photos = _measure_photos(field, views, degree)
+    photos = _measure_photos(field, clipped, views, degree)
     candidates = _candidates(field, clipped, photos)
     if not len(candidates.index):
         return []
@@ -170,27 +164,16 @@ def find_lights(
 
 @dataclass(frozen=True, eq=False)
 class _Photos:
-    """Sample of V photos, and what they receive of the N Gaussians of a scene.
+    """Sample of V photos, and what they receive of the N Gaussians of a scene."""
 
-    Attributes:
-        cameras: of the photos, in the scene's coordinates.
-        received: by each photo.
-        white: radiance that lights exceed.
-        measured: [N] sums of the pixels in photos of at least twice that white that show most of a Gaussian unclipped.
-        focal: typical focal length, pixels.
-        whites: [V] radiance that each photo clips at.
-        pixels: [N] sums over the photos.
-        radiance: [N, 3] mean towards the photos.
-    """
-
-    cameras: list[Camera]
-    received: list[ReceivedLight]
-    white: float
-    measured: Tensor
-    focal: float
-    whites: np.ndarray
-    pixels: Tensor
-    radiance: Tensor
+    cameras: list[Camera]  # Of the photos, in the scene's coordinates
+    received: list[ReceivedLight]  # By each photo
+    white: float  # Radiance that lights exceed
+    measured: Tensor  # [N] whether photos of at least twice that white show most of a Gaussian unclipped
+    focal: float  # Typical focal length, pixels
+    whites: np.ndarray  # [V] radiance that each photo clips at
+    pixels: Tensor  # [N] sums over the photos
+    radiance: Tensor  # [N, 3] mean towards the photos
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,11 +237,15 @@ class _LightPhotos(NamedTuple):
         return _LightPhotos(self.photos[clear], self.angles[clear], self.light[clear])
 
 
-def _measure_photos(field: RadianceField, views: Sequence[tuple[Camera, float]], degree: int | None) -> _Photos:
+def _measure_photos(
+    field: RadianceField, clipped: Tensor, views: Sequence[tuple[Camera, float]], degree: int | None
+) -> _Photos:
     """Render a sample of the photos, and find the white that lights exceed."""
     times = np.array([time for _, time in views])
     longest = times > times.max() / 2
-    sample = [index for part in (longest, ~longest) for index in every_nth(part.nonzero()[0], MOST_VIEWS)]
+    parts = [part.nonzero()[0] for part in (longest, ~longest)]
+    samples = [every_nth(part, MOST_VIEWS) for part in parts]
+    sample = np.concatenate(samples)
     cameras, whites = [views[index][0] for index in sample], field.response.white / times[sample]
     received = [_received_by(field, camera, degree) for camera in cameras]
     pixels = reduce(torch.add, (each.pixels for each in received))
@@ -267,9 +254,14 @@ def _measure_photos(field: RadianceField, views: Sequence[tuple[Camera, float]],
     radiance = light / angles.clamp_min(1e-20)[:, None]
     most = field.response.white / float(np.quantile(times, 0.75, method="lower"))
     white = _reference_white(np.minimum(whites, most), radiance.amax(1), pixels)
-    dark = [(camera, limit) for camera, limit in zip(cameras, whites, strict=True) if limit >= 2 * white]
-    unclipped = (_unclipped_by(field, camera, limit, degree) for camera, limit in dark)
-    measured = reduce(torch.add, unclipped, torch.zeros_like(pixels))
+    measured, of_all = torch.zeros_like(pixels), torch.full_like(pixels, 1e-12)
+    counts = np.repeat([len(part) / max(1, len(some)) for part, some in zip(parts, samples)], [*map(len, samples)])
+    for camera, limit, each, count in zip(cameras, whites, received, counts, strict=True):
+        of_all += count * each.pixels
+        if limit >= 2 * white:
+            measured += count * _unclipped_by(field, camera, limit, degree)
+    agree = 1 - clipped.to(measured.device) > measured / of_all / 2  # Photos clip, too, where the scene is too dark.
+    measured = (measured > LEAST_MEASURED) & agree
     return _Photos(cameras, received, white, measured, typical_focal_length(cameras), whites, pixels, radiance)
 
 
@@ -295,7 +287,7 @@ def _candidates(field: RadianceField, clipped: Tensor, photos: _Photos) -> _Cand
         weights=(photos.pixels * photos.radiance.mean(1))[index].cpu().numpy(),
         brightness=peak[index].cpu().numpy(),
         too_bright=(too_bright > 0)[index].cpu().numpy(),
-        measured=(photos.measured > LEAST_MEASURED)[index].cpu().numpy(),
+        measured=photos.measured[index].cpu().numpy(),
         clipped=clipped.to(device)[index].cpu().numpy(),
         stops=None if stops is None else stops.to(device)[index].cpu().numpy(),
         doubt=-confidence[index].clamp_min(2.0**-8).log2().cpu().numpy(),

@@ -9,6 +9,7 @@ from sehdr_warp.model.confidence import gather_evidence
 from sehdr_warp.model.light_shapes import fitted_shape
 from sehdr_warp.model.lights import find_lights
 from sehdr_warp.output.lighting.environment_map import latlong
+from sehdr_warp.output.lighting.lights import uncertain_lights
 from sehdr_warp.scene import Camera, View, codes_of, look_at
 from sehdr_warp.splats import GaussianArrays
 
@@ -251,11 +252,11 @@ def test_a_light_is_sure_if_a_darker_photo_shows_it_unclipped(darker, direction,
 def test_a_darker_photo_of_most_of_a_light_leaves_the_doubt_to_the_rest():
     """The part that it cuts off is what makes the light uncertain: the scene does not contradict the photo."""
     scene = field(panel(), RADIANCE, 0.03)
-    scene.clipped_stops = torch.full((scene.gaussians.count,), 1.8)
+    scene.clipped_stops = torch.full((scene.gaussians.count,), 1.5)
     (camera, time), *others = views()
     ahead = look_at(camera.position, np.add(camera.position, (0, 0, 1)), up=(0, -1, 0))
     dark = (Camera(256, 192, 240.0, 240.0, 211.0, 96.0, ahead), time / 64)
-    (light,) = find_lights(scene, torch.ones(scene.gaussians.count), [*others, dark])
+    (light,) = find_lights(scene, torch.full((scene.gaussians.count,), 5 / 6), [*others, dark])
     assert 0.6 < light.deviation < 1.0 and light.measured < 0.5
 
 
@@ -269,9 +270,24 @@ def test_a_darker_photo_measures_gaussians_that_are_brighter_than_its_white():
     *others, (camera, time) = views()
     limit = float(scene.render(camera).hdr.max())
     assert radiance.max() > 1.5 * limit
-    for white, stops in ((1.1 * limit, 0.25), (limit / 4, 1.2)):
-        (light,) = find_lights(scene, torch.ones(scene.gaussians.count), [*others, (camera, time / white)])
+    for white, clipped, stops in ((1.1 * limit, 5 / 6, 0.25), (limit / 4, 1.0, 1.2)):
+        shares = torch.full((scene.gaussians.count,), clipped)
+        (light,) = find_lights(scene, shares, [*others, (camera, time / white)])
         assert light.deviation == pytest.approx(stops, rel=0.01)
+
+
+@pytest.mark.parametrize("bright", [5, 60])
+def test_what_the_darker_photo_clips_is_not_measured_though_the_scene_is_darker(bright):
+    """A panel of which the darkest photo shows three fifths unclipped and clips the rest, which the scene misses."""
+    scene = field(panel(), RADIANCE, 0.03)
+    scene.clipped_stops = torch.full((scene.gaussians.count,), 3.0)
+    (camera, time), *others = views()
+    shots = [*(others * (bright // 5)), (camera, time / 64)]
+    unclipped = scene.gaussians.means[:, 0] < scene.gaussians.means[:, 0].quantile(0.6)
+    shares = 1 - unclipped.float() / len(shots)
+    (light,) = find_lights(scene, shares, shots)
+    assert 1.3 < light.deviation < 1.5 and light.measured < 0.2
+    assert "three photos" in uncertain_lights([light])[0] and len(uncertain_lights([light])) == 1
 
 
 def photograph(scene, views, truth=None):
