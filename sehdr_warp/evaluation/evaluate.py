@@ -32,21 +32,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Predictions:
-    """Predictions for the views of a scene.
+    """Predictions for the views of a scene."""
 
-    Attributes:
-        hdr: Returns the radiance of a view, [H, W, 3].
-        facts: Plain values for the result.
-        ldr: Returns the simulated photo of a view, [H, W, 3] in [0, 1]; None if there is none.
-        confidence: Returns how reliable the prediction for a view is, [H, W] in [0, 1]; None if that is not known.
-        black: Largest exposure that photos show as black; matters if there is a confidence.
-    """
-
-    hdr: Callable[[View], Tensor]
-    facts: dict[str, Any]
-    ldr: Callable[[View], Tensor | None] = lambda view: None
-    confidence: Callable[[View], Tensor | None] = lambda view: None
-    black: float = 0.0
+    hdr: Callable[[View], Tensor]  # Returns the radiance of a view, [H, W, 3]
+    facts: dict[str, Any]  # Plain values for the result
+    ldr: Callable[[View], Tensor | None] = lambda view: None  # Simulated photo of a view, [H, W, 3] in [0, 1], or None
+    confidence: Callable[[View], Tensor | None] = lambda view: None  # Its reliability [H, W] in [0, 1], or None
+    black: float = 0.0  # Largest exposure that photos show as black; matters if there is a confidence
 
 
 def _run_predictions(run: "Run") -> Predictions:

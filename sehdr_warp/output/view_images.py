@@ -21,23 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ViewImages:
-    """A rendered view on the CPU.
+    """A rendered view on the CPU."""
 
-    Attributes:
-        camera: In the coordinates of the file.
-        hdr: [H, W, 3] linear Rec.709 radiance.
-        alpha: [H, W] coverage.
-        depth: [H, W] in the file's units, along the camera's axis, of a wide camera the distance; 0 where nothing is.
-        confidence: [H, W] in [0, 1]; None if it was not measured.
-        clipped: [H, W] share of the light that photos clip; None if no AOV asks for it.
-    """
-
-    camera: Camera
-    hdr: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
-    confidence: np.ndarray | None
-    clipped: np.ndarray | None
+    camera: Camera  # In the coordinates of the file
+    hdr: np.ndarray  # [H, W, 3] linear Rec.709 radiance
+    alpha: np.ndarray  # [H, W] coverage
+    depth: np.ndarray  # [H, W] file units along the axis, of a wide camera the distance; 0 where nothing is
+    confidence: np.ndarray | None  # [H, W] in [0, 1]; None if it was not measured
+    clipped: np.ndarray | None  # [H, W] share of the light that photos clip; None if no AOV asks for it
 
 
 def render_images(

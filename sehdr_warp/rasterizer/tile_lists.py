@@ -27,25 +27,14 @@ MIN_CHUNK = 1 << 14  # Intersections that are worth a thread's time.
 
 
 class PackedSplats(NamedTuple):
-    """Values of each splat that the lists and blending read; those of blending in rows of four.
+    """Values of each splat that the lists and blending read; those of blending in rows of four."""
 
-    Attributes:
-        means_opacities: [N, 4] x, y, opacity, half-height.
-        conics_cutoffs: [N, 4] conic a, b, c, and the value of a dx^2 + 2 b dx dy + c dy^2 at which alpha meets the
-            threshold; -1 if culled.
-        counts: [N] int64 tiles that the ellipse touches.
-        depths: [N] as of Splats2D.
-        extents: [N, 2] as of Splats2D.
-        padded: [N, columns] features with columns of zeros for whole rows of four, which block kernels read at once;
-            None if they do not read them from here.
-    """
-
-    means_opacities: Tensor
-    conics_cutoffs: Tensor
-    counts: Tensor
-    depths: Tensor
-    extents: Tensor
-    padded: Tensor | None = None
+    means_opacities: Tensor  # [N, 4] x, y, opacity, half-height
+    conics_cutoffs: Tensor  # [N, 4] conic a, b, c; a dx^2 + 2 b dx dy + c dy^2 at the threshold, -1 if culled
+    counts: Tensor  # [N] int64 tiles that the ellipse touches
+    depths: Tensor  # [N] as of Splats2D
+    extents: Tensor  # [N, 2] as of Splats2D
+    padded: Tensor | None = None  # [N, columns] features in whole rows of four for block kernels; None if unread
 
 
 class TileGrid(NamedTuple):
@@ -80,30 +69,17 @@ class EmitOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class TileLists:
-    """For each tile the Gaussians that touch it, front to back. All indices are int32.
+    """For each tile the Gaussians that touch it, front to back. All indices are int32."""
 
-    Attributes:
-        tile_ranges: [tiles, 2] first intersection of each tile and one past its last.
-        gaussians: [M] the Gaussian of each intersection.
-        subtile_masks: [M] uint8, bit k set if the ellipse touches subtile k of its tile; None where no block kernel
-            reads them: from the CPU's sort by counting, and for rasterize_directions().
-        emit_order: of the intersections before the sort; None unless it was to be kept, for sum_by_gaussian().
-        emit_indices: [M] index of each intersection in that order; None without it.
-        width: of the image in pixels.
-        height: of the image in pixels.
-        overflow: scalar bool, whether max_intersections was too few; None without it.
-        total: scalar int64, how many intersections there are, listed or not.
-    """
-
-    tile_ranges: Tensor
-    gaussians: Tensor
-    subtile_masks: Tensor | None
-    emit_order: EmitOrder | None
-    emit_indices: Tensor | None
-    width: int
-    height: int
-    overflow: Tensor | None
-    total: Tensor
+    tile_ranges: Tensor  # [tiles, 2] first intersection of each tile and one past its last
+    gaussians: Tensor  # [M] the Gaussian of each intersection
+    subtile_masks: Tensor | None  # [M] uint8, bit k: the ellipse touches subtile k; None if no kernel reads it
+    emit_order: EmitOrder | None  # Before the sort, for sum_by_gaussian(); None unless it was to be kept
+    emit_indices: Tensor | None  # [M] index of each intersection in that order; None without it
+    width: int  # Of the image in pixels
+    height: int  # Of the image in pixels
+    overflow: Tensor | None  # Scalar bool, whether max_intersections was too few; None without it
+    total: Tensor  # Scalar int64, how many intersections there are, listed or not
 
     @property
     def grid(self) -> TileGrid:

@@ -101,44 +101,23 @@ NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 
 @dataclass(frozen=True)
 class DataparserOutputs:
-    """A data folder as parsed.
+    """A data folder as parsed."""
 
-    Attributes:
-        format: the layout; see Scene.
-        records: the photos.
-        alpha: what transparency means: "background" (nothing there: composite over black light) or "mask" (not
-            observed).
-        holdout: (step, offset) of the held-out views in the protocol that the layout was published with; None for a
-            layout without one.
-        cloud: the points that come with the set.
-        notes: see Scene.
-        name: what the user asked for.
-        folder: where the set lies.
-        times_known: False if no file states exposure times.
-        stated_response: name of the response that the files state (a video's log curve); None if they do not.
-        color_matrix: [3, 3] from the colors of the photos' light to linear Rec.709; None if they are Rec.709.
-        within_rec709: the light of the stated response lies within Rec.709, to which photos are converted when they
-            are read.
-        mentioned: names of photos that a note names, and that are in no record.
-        unplaced: number of photos that structure from motion could not place, which are in no record.
-        kind: of the photos: encoded, linear, gain-map, raw or float; see ldr_files.file_kind() and response_choice.py.
-    """
-
-    format: str
-    records: tuple[ImageRecord, ...]
-    alpha: str = "mask"
-    holdout: tuple[int, int] | None = None
-    cloud: PointCloud = NO_POINTS
-    notes: tuple[str, ...] = ()
-    name: str = ""
-    folder: Path = Path()
-    times_known: bool = True
-    kind: str = "encoded"
-    stated_response: str | None = None
-    color_matrix: np.ndarray | None = None
-    within_rec709: bool = False
-    mentioned: tuple[str, ...] = ()
-    unplaced: int = 0
+    format: str  # The layout; see Scene
+    records: tuple[ImageRecord, ...]  # The photos
+    alpha: str = "mask"  # Transparency is "background" (black light) or "mask" (not observed)
+    holdout: tuple[int, int] | None = None  # (step, offset) of the layout's published held-out views; or None
+    cloud: PointCloud = NO_POINTS  # The points that come with the set
+    notes: tuple[str, ...] = ()  # See Scene
+    name: str = ""  # What the user asked for
+    folder: Path = Path()  # Where the set lies
+    times_known: bool = True  # False if no file states exposure times
+    kind: str = "encoded"  # encoded, linear, gain-map, raw or float; see file_kind(), response_choice.py
+    stated_response: str | None = None  # That files state (a video's log curve); None without one
+    color_matrix: np.ndarray | None = None  # [3, 3] from the photos' light to linear Rec.709; None if the same
+    within_rec709: bool = False  # The stated response's light is in Rec.709, to which photos are converted
+    mentioned: tuple[str, ...] = ()  # Names of photos that a note names, and that are in no record
+    unplaced: int = 0  # Number of photos that structure from motion could not place, which are in no record
 
     @property
     def training(self) -> tuple[ImageRecord, ...]:

@@ -21,15 +21,10 @@ LEAST_SPREAD = 1e-9
 
 @dataclass(frozen=True)
 class Normalization:
-    """A similarity between scene coordinates and normalized coordinates: normalized = (scene - center) / unit.
+    """A similarity between scene coordinates and normalized coordinates: normalized = (scene - center) / unit."""
 
-    Attributes:
-        center: [3] float64, scene coordinates of the normalized origin.
-        unit: scene units per normalized unit, positive and finite.
-    """
-
-    center: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    unit: float = 1.0
+    center: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] float64, scene coordinates of its origin
+    unit: float = 1.0  # Scene units per normalized unit, positive and finite
 
     def __post_init__(self) -> None:
         """Check the values; raise ValueError for a center that is not finite or a unit that is not positive."""

@@ -32,19 +32,12 @@ _BELOW_WHITE = 0.97  # Code of the largest light of a gain map, in light: from 0
 
 @dataclass(frozen=True)
 class ResponseChoice:
-    """The response of a dataset.
+    """The response of a dataset."""
 
-    Attributes:
-        dataset: The dataset; its kind may have changed to linear or gain-map, and it may have more notes.
-        response: The camera response.
-        color_matrix: As in Scene.
-        chosen_by: As in Scene.
-    """
-
-    dataset: DataparserOutputs
-    response: "Response"
-    color_matrix: np.ndarray | None
-    chosen_by: tuple[str, tuple[str, ...]] | None = None
+    dataset: DataparserOutputs  # The dataset, whose kind may now be linear or gain-map, and with more notes
+    response: "Response"  # The camera response
+    color_matrix: np.ndarray | None  # As in Scene
+    chosen_by: tuple[str, tuple[str, ...]] | None = None  # As in Scene
 
 
 def choose_response(

@@ -26,15 +26,10 @@ _MOST_SAMPLES, _STEPS_PER_STOP = 200_000, 16
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Shot noise and read noise of a linear sensor, in electrons.
+    """Shot noise and read noise of a linear sensor, in electrons."""
 
-    Attributes:
-        full_well: at the response's clip_exposure; for a curve that only approaches its peak, at Response.white.
-        read_noise: standard deviation.
-    """
-
-    full_well: float = 20_000.0
-    read_noise: float = 5.0
+    full_well: float = 20_000.0  # At the response's clip_exposure; of a curve that only nears its peak, at its white
+    read_noise: float = 5.0  # Standard deviation
 
     def __post_init__(self):
         """Check the figures."""

@@ -14,19 +14,12 @@ TONES = {"none": NO_TONE, "reinhard": REINHARD, "filmic": FILMIC, "knee": KNEE}
 
 @dataclass(frozen=True)
 class FormulaCurve:
-    """A camera response that has a formula.
+    """A camera response that has a formula."""
 
-    Attributes:
-        power_law: exponent, offset, slope and end of the toe, as response.analytic.PowerLaw holds them.
-        tone: the curve before it, a name in TONES.
-        tone_numbers: of the tone curve.
-        clip: the clip point, infinite for none.
-    """
-
-    power_law: tuple[float, float, float, float]
-    tone: str = "none"
-    tone_numbers: tuple[float, ...] = ()
-    clip: float = 1.0
+    power_law: tuple[float, float, float, float]  # Exponent, offset, slope and end of the toe, as of PowerLaw
+    tone: str = "none"  # The curve before it, a name in TONES
+    tone_numbers: tuple[float, ...] = ()  # Of the tone curve
+    clip: float = 1.0  # The clip point, infinite for none
 
 
 @torch.no_grad()

@@ -49,23 +49,14 @@ _EXIF_IFD = 0x8769
 
 @dataclass(frozen=True)
 class ColorEncoding:
-    """Encoding of a photo, as its file states it.
+    """Encoding of a photo, as its file states it."""
 
-    Attributes:
-        name: for the user, such as "Display P3 (ICC profile)".
-        to_rec709: [3, 3] from the primaries of the codes to linear Rec.709; None if they are Rec.709's.
-        curves: decoded values at evenly spaced codes from 0 to 1, by channel; empty for sRGB's curve, or a table.
-        light: what light the codes state ("linear light", "PQ light", ...); None for a display curve.
-        table: of an ICC profile, in place of primaries and curves.
-        problem: what is wrong with the statement, if it is not used.
-    """
-
-    name: str
-    to_rec709: np.ndarray | None = None
-    curves: tuple[np.ndarray, ...] = ()
-    light: str | None = None
-    table: IccTable | None = None
-    problem: str | None = None
+    name: str  # For the user, such as "Display P3 (ICC profile)"
+    to_rec709: np.ndarray | None = None  # [3, 3] from the codes' primaries to linear Rec.709; None if the same
+    curves: tuple[np.ndarray, ...] = ()  # Decoded values at even codes, by channel; empty for sRGB's, or a table
+    light: str | None = None  # What light the codes state ("linear light", "PQ light", ...); None for a display curve
+    table: IccTable | None = None  # Of an ICC profile, in place of primaries and curves
+    problem: str | None = None  # What is wrong with the statement, if it is not used
 
     @property
     def is_srgb(self) -> bool:

@@ -82,24 +82,14 @@ class IccTable:
 
 @dataclass(frozen=True)
 class IccProfile:
-    """Colors that a profile states.
+    """Colors that a profile states."""
 
-    Attributes:
-        name: its description.
-        colors: "RGB" or "GRAY".
-        to_rec709: [3, 3] to linear Rec.709; None for grey.
-        curves: decoded values at evenly spaced codes from 0 to 1, one array for each channel; empty if the profile is
-            a table.
-        cicp: (primaries, transfer) of ITU-T H.273, if the profile states them.
-        table: the profile's table, which stands before matrix and curves; None if it has none.
-    """
-
-    name: str
-    colors: str
-    to_rec709: np.ndarray | None
-    curves: tuple[np.ndarray, ...]
-    cicp: tuple[int, int] | None
-    table: IccTable | None = None
+    name: str  # Its description
+    colors: str  # "RGB" or "GRAY"
+    to_rec709: np.ndarray | None  # [3, 3] to linear Rec.709; None for grey
+    curves: tuple[np.ndarray, ...]  # Decoded values at even codes from 0 to 1, by channel; empty for a table
+    cicp: tuple[int, int] | None  # (primaries, transfer) of ITU-T H.273, if the profile states them
+    table: IccTable | None = None  # The profile's table, which stands before matrix and curves; None if it has none
 
 
 @lru_cache(maxsize=64)

@@ -48,17 +48,11 @@ _APPLE_AUX = "urn:com:apple:photo:2020:aux:hdrgainmap"
 
 @dataclass(frozen=True)
 class GainMap:
-    """A gain map as its file stores it.
+    """A gain map as its file stores it."""
 
-    Attributes:
-        encoded: [h, w, 1 or 3] float32 in [0, 1], of fewer pixels than the photo as a rule.
-        parameters: what they stand for.
-        to_alternate: [3, 3] from the photo's primaries to those in which the gains apply; None if they are the photo's.
-    """
-
-    encoded: np.ndarray
-    parameters: GainMapParameters
-    to_alternate: np.ndarray | None = None
+    encoded: np.ndarray  # [h, w, 1 or 3] float32 in [0, 1], of fewer pixels than the photo as a rule
+    parameters: GainMapParameters  # What they stand for
+    to_alternate: np.ndarray | None = None  # [3, 3] from the photo's primaries to the gains'; None if the same
 
     @property
     def headroom(self) -> float:

@@ -29,15 +29,10 @@ _RADIANCE = (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.333, 0.333)
 
 
 class Light(NamedTuple):
-    """A scene-linear picture.
+    """A scene-linear picture."""
 
-    Attributes:
-        pixels: [H, W, 3] float32 linear Rec.709, as read_hdr() returns them: over black, if alpha covers a part.
-        coverage: [H, W] float32 in [0, 1], 0 where nothing was rendered or photographed; None if all is covered.
-    """
-
-    pixels: np.ndarray
-    coverage: np.ndarray | None
+    pixels: np.ndarray  # [H, W, 3] float32 linear Rec.709 of read_hdr(): over black, if alpha covers a part
+    coverage: np.ndarray | None  # [H, W] float32 in [0, 1], 0 where nothing was rendered; None if all is covered
 
     @property
     def uncovered(self) -> np.ndarray:

@@ -25,38 +25,23 @@ _HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"mif1", b"mif2", b"hevc", b
 
 @dataclass(frozen=True)
 class Item:
-    """A picture, a derived picture or metadata in a HEIF file.
+    """A picture, a derived picture or metadata in a HEIF file."""
 
-    Attributes:
-        kind: hvc1, av01, grid, tmap, Exif, mime, ...
-        extents: (offset in the file, length) of its parts; lengths of 0 reach to the end.
-        inside: the bytes themselves, if they lie in the meta box; None otherwise.
-        properties: (type, payload) of each property, for example `colr`.
-        flags_place: where in the file the byte of flags lies, whose lowest bit hides the item from viewers.
-    """
-
-    kind: str
-    extents: tuple[tuple[int, int], ...] = ()
-    inside: bytes | None = None
-    properties: tuple[tuple[str, bytes], ...] = ()
-    flags_place: int = 0
+    kind: str  # As hvc1, av01, grid, tmap, Exif or mime
+    extents: tuple[tuple[int, int], ...] = ()  # (offset in the file, length) of parts; length 0: to the end
+    inside: bytes | None = None  # The bytes themselves, if they lie in the meta box; None otherwise
+    properties: tuple[tuple[str, bytes], ...] = ()  # (type, payload) of each property, for example `colr`
+    flags_place: int = 0  # Where in the file the byte of flags lies, whose lowest bit hides the item from viewers
 
 
 @dataclass(frozen=True)
 class HeifItems:
-    """Items of a file's meta box.
+    """Items of a file's meta box."""
 
-    Attributes:
-        primary: number of the picture that a viewer shows.
-        items: by number.
-        references: (kind, from, to) of each reference, for example ("dimg", tmap, (base, gain map)).
-        primary_place: where in the file the number of the primary item lies, and its bytes (2 or 4).
-    """
-
-    primary: int
-    items: dict[int, Item]
-    references: tuple[tuple[str, int, tuple[int, ...]], ...]
-    primary_place: tuple[int, int]
+    primary: int  # Number of the picture that a viewer shows
+    items: dict[int, Item]  # By number
+    references: tuple[tuple[str, int, tuple[int, ...]], ...]  # (kind, from, to): ("dimg", tmap, (base, gain map))
+    primary_place: tuple[int, int]  # Where in the file the number of the primary item lies, and its bytes (2 or 4)
 
 
 @cache

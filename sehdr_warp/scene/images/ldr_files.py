@@ -66,20 +66,12 @@ PILLOW_ERRORS = (
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """The codes of a photo, and what its file states beside them.
+    """The codes of a photo, and what its file states beside them."""
 
-    Attributes:
-        pixels: [H, W, 3] uint8 or uint16, the stored codes.
-        alpha: [H, W] float32 in [0, 1]; None if all is opaque.
-        above_white: [H, W, 3] float16, light of white pixels as a multiple of white's; 0 where it is not known. None if
-            the file states none.
-        above_white_deviation: standard deviation of the natural logarithm of above_white.
-    """
-
-    pixels: np.ndarray
-    alpha: np.ndarray | None
-    above_white: np.ndarray | None = None
-    above_white_deviation: float = 0.0
+    pixels: np.ndarray  # [H, W, 3] uint8 or uint16, the stored codes
+    alpha: np.ndarray | None  # [H, W] float32 in [0, 1]; None if all is opaque
+    above_white: np.ndarray | None = None  # [H, W, 3] float16, light over white's; 0 if unknown. None if not stated
+    above_white_deviation: float = 0.0  # Standard deviation of the natural logarithm of above_white
 
     @property
     def levels(self) -> int:

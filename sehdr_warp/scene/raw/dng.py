@@ -52,35 +52,20 @@ class JpegTiles:
 
 @dataclass(frozen=True)
 class DngRaw:
-    """The tags of a DNG's raw image that decide what its samples mean.
+    """The tags of a DNG's raw image that decide what its samples mean."""
 
-    Attributes:
-        size: (width, height) of the stored image.
-        pattern: [n, n] channels (0, 1, 2) of the color filter from the active area's top left; None for linear raw,
-            which has three samples a pixel.
-        active: top, left, bottom, right of the part that holds the picture, in pixels of the stored image.
-        black: [rows, columns, samples] float64, repeated over the active area from its top left.
-        black_columns: [width of the active area] added to the black level; likewise black_rows.
-        white: [samples] float64.
-        scale: (horizontal, vertical): factors to square pixels.
-        crop: left, top, width, height of the picture inside the active area, in pixels before scale.
-        orientation: EXIF's, 1 to 8.
-        opcodes: the opcode lists 1 (stored samples), 2 (light before demosaicing) and 3 (after it), as bytes.
-        tiles: of a lossy DNG, which LibRaw decodes by a curve of its own; None otherwise.
-    """
-
-    size: tuple[int, int]
-    pattern: np.ndarray | None
-    active: tuple[int, int, int, int]
-    black: np.ndarray
-    black_columns: np.ndarray
+    size: tuple[int, int]  # (width, height) of the stored image
+    pattern: np.ndarray | None  # [n, n] channels of the filter from the active area's top left; None for linear raw
+    active: tuple[int, int, int, int]  # Top, left, bottom, right of the picture, pixels of the stored image
+    black: np.ndarray  # [rows, columns, samples] float64, repeated over the active area from its top left
+    black_columns: np.ndarray  # [width of the active area] added to the black level; likewise black_rows
     black_rows: np.ndarray
-    white: np.ndarray
-    scale: tuple[float, float]
-    crop: tuple[float, float, float, float]
-    orientation: int
-    opcodes: tuple[bytes, bytes, bytes]
-    tiles: JpegTiles | None = None
+    white: np.ndarray  # [samples] float64
+    scale: tuple[float, float]  # (horizontal, vertical): factors to square pixels
+    crop: tuple[float, float, float, float]  # Left, top, width, height inside the active area, pixels before scale
+    orientation: int  # EXIF's, 1 to 8
+    opcodes: tuple[bytes, bytes, bytes]  # Lists 1 (stored samples), 2 (light) and 3 (demosaiced light), as bytes
+    tiles: JpegTiles | None = None  # Of a lossy DNG, which LibRaw decodes by a curve of its own; None otherwise
 
     @property
     def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -25,15 +25,10 @@ _LEAST_WHITE, _PILE = 0.75, 64
 
 @dataclass(frozen=True)
 class SensorLight:
-    """A developed RAW photo.
+    """A developed RAW photo."""
 
-    Attributes:
-        light: [H, W, 3] float32 in the sensor's colors, 1 at the white level; above 1 where a gain map says so.
-        clipped: [H, W, 3] bool, where the sensor clipped.
-    """
-
-    light: np.ndarray
-    clipped: np.ndarray
+    light: np.ndarray  # [H, W, 3] float32 in the sensor's colors, 1 at the white level; more where a gain map says so
+    clipped: np.ndarray  # [H, W, 3] bool, where the sensor clipped
 
 
 def clipping_level(shares: np.ndarray) -> float:

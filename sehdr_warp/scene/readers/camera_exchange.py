@@ -31,17 +31,11 @@ _MOST_FRAMES = 100_000
 
 
 class ExchangeCameras(NamedTuple):
-    """Cameras of a file.
+    """Cameras of a file."""
 
-    Attributes:
-        cameras: Name and camera, in the file's order; a moving camera is one for each frame, NAME_0001 and so on.
-        world_matrix: [4, 4] from the photos' coordinates to the file's, if the file states it; else None.
-        up_stated: Whether the file states its up axis, or needs none.
-    """
-
-    cameras: list[tuple[str, Camera]]
-    world_matrix: np.ndarray | None = None
-    up_stated: bool = True
+    cameras: list[tuple[str, Camera]]  # Name and camera in the file's order; NAME_0001 and so on of a moving one
+    world_matrix: np.ndarray | None = None  # [4, 4] from the photos' coordinates to the file's; None if not stated
+    up_stated: bool = True  # Whether the file states its up axis, or needs none
 
 
 def read_exchange_cameras(path: Path) -> ExchangeCameras:

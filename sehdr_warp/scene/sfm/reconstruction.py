@@ -51,18 +51,11 @@ _PAIR_COST, _PLACE_COST = 0.1, 0.45  # Time to match a pair and to place a photo
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Result of structure from motion.
+    """Result of structure from motion."""
 
-    Attributes:
-        model: cameras, poses and points. Names are the photos' indices (`00003.png` is photos[3]); photos that could
-            not be placed are missing.
-        error: mean reprojection error in pixels, at photos of at most MAX_SIDE pixels.
-        weak: indices of the photos that share fewer than FEWEST_SHARED points with others.
-    """
-
-    model: SparseModel
-    error: float
-    weak: tuple[int, ...]
+    model: SparseModel  # Cameras, poses and points; `00003.png` is photos[3], photos not placed are missing
+    error: float  # Mean reprojection error in pixels, at photos of at most MAX_SIDE pixels
+    weak: tuple[int, ...]  # Indices of the photos that share fewer than FEWEST_SHARED points with others
 
     @property
     def sure(self) -> int:

@@ -52,25 +52,15 @@ _LOGS = {
 
 @dataclass(frozen=True)
 class VideoColor:
-    """Colors that a clip states.
+    """Colors that a clip states."""
 
-    Attributes:
-        curve: of its codes, in words.
-        response: name of the response that the curve stands for; None for a camera's own development (SDR).
-        primaries: name of the primaries in colour-science; None for Rec.709.
-        matrix: (kr, kb) of the luma that the codes were made with; None for stored RGB.
-        full_range: whether codes use the whole range.
-        bits: of a sample.
-        display: way of the codes to sRGB's; None if they count as sRGB's, or have a response of their own.
-    """
-
-    curve: str
-    response: str | None
-    primaries: str | None
-    matrix: tuple[float, float] | None
-    full_range: bool
-    bits: int
-    display: ColorEncoding | None = None
+    curve: str  # Of its codes, in words
+    response: str | None  # Name of the response that the curve stands for; None for a camera's own development (SDR)
+    primaries: str | None  # Name of the primaries in colour-science; None for Rec.709
+    matrix: tuple[float, float] | None  # (kr, kb) of the luma that the codes were made with; None for stored RGB
+    full_range: bool  # Whether codes use the whole range
+    bits: int  # Of a sample
+    display: ColorEncoding | None = None  # From the codes to sRGB's; None if they are these, or have a response
 
     def to_rec709(self) -> np.ndarray | None:
         """Return [3, 3] from the clip's linear colors to linear Rec.709, or None if they are Rec.709."""
