@@ -80,8 +80,7 @@ _WITHOUT_TORCH = {"presets", "config", "responses", "scenes", "completion"}
 """Commands that do not load torch, and so run in little address space."""
 _MIN_ADDRESS_SPACE = 1536 << 20
 """Bytes below which native libraries fail to reserve memory and crash with confusing messages."""
-_reserve = [bytearray(4 << 20)]
-"""Memory that is released to print an error when a command has run out of memory."""
+_reserve = [bytearray(4 << 20)]  # Memory that is released to print an error when a command has run out of memory
 
 
 def main(arguments: list[str] | None = None) -> None:

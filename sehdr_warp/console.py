@@ -16,14 +16,11 @@ from typing import Any
 from .errors import visible
 from .progress import LINE_INTERVAL, Stage, display_stages, format_seconds
 
-BAR_INTERVAL = 0.25
-"""Least seconds between updates of the bar. Each reads the loss, which waits for the device."""
-READ_INTERVAL = 2.0
-"""Least seconds between two readings of the figures for plain lines, of which a line shows the mean."""
+BAR_INTERVAL = 0.25  # Least seconds between updates of the bar. Each reads the loss, which waits for the device.
+READ_INTERVAL = 2.0  # Least seconds between two readings of the figures for plain lines, of which a line shows the mean
 MEAN_OF = 20
 """Readings of loss and PSNR that their running mean is over: each is of one photo, and photos differ by decibels."""
-MAX_READING_SHARE = 1 / 20
-"""Part of the time that reading figures for updates may take."""
+MAX_READING_SHARE = 1 / 20  # Part of the time that reading figures for updates may take
 
 
 class _LogLines(logging.Handler):

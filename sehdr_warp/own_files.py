@@ -13,8 +13,7 @@ from pathlib import Path
 from .errors import InputError
 
 LIST = ".sehdr-warp"
-_LARGEST_LIST = 256 << 20
-"""Bytes of a list that is read; a list of a million files has a third of it."""
+_LARGEST_LIST = 256 << 20  # Bytes of a list that is read; a list of a million files has a third of it
 
 
 def list_folder(folder: Path) -> None:

@@ -17,8 +17,7 @@ from .limits import processor_limit
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-WAITING_NOTICE = 5.0
-"""Seconds after which a wait is logged."""
+WAITING_NOTICE = 5.0  # Seconds after which a wait is logged
 _LOOK_EVERY = 0.1
 
 

@@ -11,12 +11,10 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 Item = TypeVar("Item")
-LINE_INTERVAL = 10.0
-"""Seconds between log lines about a stage."""
+LINE_INTERVAL = 10.0  # Seconds between log lines about a stage
 
 Display = Callable[["Stage"], None]
-_displays: list[Display] = []
-"""Displays that show stages in place of log lines; the last one is used."""
+_displays: list[Display] = []  # Displays that show stages in place of log lines; the last one is used
 
 
 class Stage:

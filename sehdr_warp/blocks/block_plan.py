@@ -39,8 +39,7 @@ log = logging.getLogger(__name__)
 
 FORMAT = 1
 FILE = "blocks.json"
-MOST_BLOCKS = 10_000
-"""Largest number of blocks; more than that many trainings are never one set."""
+MOST_BLOCKS = 10_000  # Largest number of blocks; more than that many trainings are never one set
 FEWEST_POINTS, MATCHED = 500, 4000  # With fewer points in the set, pixels are matched to divide by
 MOST_MATCHED = 400  # Photos that are matched for that
 

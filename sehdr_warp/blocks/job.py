@@ -19,8 +19,7 @@ from .division import weights_of
 
 log = logging.getLogger(__name__)
 
-FOLDER = "blocks"
-"""Folder of the blocks' runs, in that of the merged run."""
+FOLDER = "blocks"  # Folder of the blocks' runs, in that of the merged run
 FEWEST_VIEWS = 2  # Photos of a block that must contain a sparse point for the block to start from it
 MOST_POINTS = 4  # Sparse points that are looked at, relative to the largest number of Gaussians
 

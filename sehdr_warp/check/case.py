@@ -13,14 +13,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-UNIT = 2.0**-24
-"""float32's unit of rounding."""
-TINY = torch.finfo(torch.float32).tiny
-"""float32's smallest normal number."""
+UNIT = 2.0**-24  # float32's unit of rounding
+TINY = torch.finfo(torch.float32).tiny  # float32's smallest normal number
 ROUNDINGS = 8
 """Units of rounding between two interfaces. project(), the longest chain, has about 40, which partly cancel."""
-DRAWS = 4
-"""Random disturbances. The bound is twice their largest effect, plus ROUNDINGS units of the result itself."""
+DRAWS = 4  # Random disturbances. The bound is twice their largest effect, plus ROUNDINGS units of the result itself.
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,11 @@ import numpy as np
 
 from ..scene import Camera
 
-BRIGHT = 10.0
-"""A pixel belongs to a light if its radiance is above this multiple of its view's mean."""
-MIN_PIXELS = 6
-"""Pixels of the smallest region that counts as a light."""
-MIN_SHARE = 0.5
-"""Part of its radiance with which a region must be rendered, else it counts as lost."""
-MARGIN = 2
-"""Pixels around a region whose light counts as the light's energy, because renders blur its edge."""
-MAX_AREA_RATIO = 3.3
-"""Largest ratio between the areas of two regions that can show the same light."""
+BRIGHT = 10.0  # A pixel belongs to a light if its radiance is above this multiple of its view's mean
+MIN_PIXELS = 6  # Pixels of the smallest region that counts as a light
+MIN_SHARE = 0.5  # Part of its radiance with which a region must be rendered, else it counts as lost
+MARGIN = 2  # Pixels around a region whose light counts as the light's energy, because renders blur its edge
+MAX_AREA_RATIO = 3.3  # Largest ratio between the areas of two regions that can show the same light
 TOLERANCE_PIXELS, TOLERANCE_RADII = 1.0, 0.35
 """Largest distance of a light's point from the center of its region: pixels, plus this part of the region's radius."""
 

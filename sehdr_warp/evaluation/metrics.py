@@ -17,12 +17,10 @@ DARK_CODE = 16
 """A pixel is dark if no channel exceeds this code, where one code is over 6 % of the value and 12 % of radiance."""
 REGIONS = ("clipped", "well-exposed", "dark")
 
-LUMINANCE = (0.212656, 0.715158, 0.072186)
-"""Rec.709 luminance weights, as in the PU21 reference implementation."""
+LUMINANCE = (0.212656, 0.715158, 0.072186)  # Rec.709 luminance weights, as in the PU21 reference implementation
 PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204, 596.3148142)
 """Parameters of PU21 "banding_glare", the variant that its authors recommend."""
-PU21_RANGE = (0.005, 10000.0)
-"""Luminance that PU21 covers, cd/m^2."""
+PU21_RANGE = (0.005, 10000.0)  # Luminance that PU21 covers, cd/m^2
 PU21_PEAK = 256.0
 """Peak that the reference implementation uses for PSNR and SSIM of PU21 values; 100 cd/m^2 encode to it."""
 

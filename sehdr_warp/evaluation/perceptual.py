@@ -15,12 +15,10 @@ from ..errors import InputError
 
 VARIABLE = "SEHDR_LPIPS"
 BACKBONE = "squeeze v0.1"
-SMALLEST_EDGE = 17
-"""Pixels of the shortest edge for which the last pooling has an output."""
+SMALLEST_EDGE = 17  # Pixels of the shortest edge for which the last pooling has an output
 TAPS, WIDTHS = (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512)
 """Layers whose outputs are compared, and their channels."""
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Normalisation of the input, as in the lpips package."""
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # Normalisation of the input, as in the lpips package
 
 
 class _Fire(nn.Module):

@@ -21,8 +21,7 @@ from .metrics import maximum, mu_law, psnr, region_masks
 PROTOCOLS = ("gt-max", "self-max", "aligned")
 VOTING_FLOOR = 1e-4
 """Values below this fraction of a view's maximum do not vote on the scale, because their logarithm is noise."""
-VOTES_PER_VIEW = 65536
-"""Evenly spaced pixels of a view that vote, so that large photos need little memory."""
+VOTES_PER_VIEW = 65536  # Evenly spaced pixels of a view that vote, so that large photos need little memory
 MIN_VOTES = 100
 """Fewer votes, such as those of mixed pixels at the border of a white photo, are joined by clipped pixels."""
 

@@ -9,8 +9,7 @@ from ..subsets import every_nth
 from .metrics import mu_law
 from .protocols import log_ratios, median_factor
 
-MAX_PIXELS = 16384
-"""Evenly spaced pixels that are ranked of one view."""
+MAX_PIXELS = 16384  # Evenly spaced pixels that are ranked of one view
 DARKEST_CODE = 0.5 / 255
 """The value of a photo that is stored as black. Darker light counts as this, before logarithms."""
 

@@ -15,8 +15,7 @@ from ..parallel import thread_count
 from ..splats.arrays import HARMONIC_0
 
 PARAMETER_NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics_dc", "harmonics_rest")
-INVISIBLE_LOGIT = -1e4
-"""Opacity logit whose sigmoid is exactly 0 in float32."""
+INVISIBLE_LOGIT = -1e4  # Opacity logit whose sigmoid is exactly 0 in float32
 
 
 class Optimizer(Protocol):

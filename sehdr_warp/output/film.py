@@ -64,8 +64,7 @@ TRANSFERS = {
 _FASTSTART = (".mp4", ".mov", ".m4v")
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".avi": "avi", ".ts": "mpegts"}
 """FFmpeg's formats by suffix: those of one file. Others write further files beside it, whoever owns their names."""
-_SLOWEST, _FASTEST = 0.1, 1000.0
-"""Frames a second."""
+_SLOWEST, _FASTEST = 0.1, 1000.0  # Frames a second
 _NTSC = 1e-4  # Relative difference up to which a rate is a whole one over 1.001, as of television
 _SQUARE = 0.005  # Difference of width and height up to which a calibrated camera's pixels are meant to be square
 

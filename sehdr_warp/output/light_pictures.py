@@ -17,8 +17,7 @@ from .images.display import display_gain, encode_srgb
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene
 
-SPLIT = markup('<div class="split" style="left: 50%"></div>')
-"""The handle between two pictures."""
+SPLIT = markup('<div class="split" style="left: 50%"></div>')  # The handle between two pictures
 _DIAL_STOPS = 8.0  # Range of the dial
 CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
 

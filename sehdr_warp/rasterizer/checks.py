@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 DEVICES = "cpu", "cuda"
-SINGULAR = 1e-9
-"""Least determinant of a camera's rotation, relative to the cube of its largest number."""
+SINGULAR = 1e-9  # Least determinant of a camera's rotation, relative to the cube of its largest number
 
 
 def check_tensors(**arguments: tuple[Any, tuple[int | str, ...]]) -> None:

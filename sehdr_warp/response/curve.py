@@ -17,8 +17,7 @@ HALF_CODE = 0.5 / 255
 # white, enough for a gradient.
 EXTENSION_SLOPE = 0.05
 START_FLOOR = 1e-6
-Numbers: TypeAlias = np.ndarray | float | Sequence[Any]
-"""Values that can be turned into an array."""
+Numbers: TypeAlias = np.ndarray | float | Sequence[Any]  # Values that can be turned into an array
 
 
 class Response(ABC):

@@ -25,8 +25,7 @@ log = logging.getLogger(__name__)
 _MAX_FILE_BYTES = 1 << 20
 _REMEDY = "`sehdr-warp config` lists every field with its meaning"
 _GONE = tomllib.loads((resources.files("sehdr_warp.runs") / "gone.toml").read_text(encoding="utf-8"))
-RENAMED: dict[str, str] = _GONE.pop("renamed")
-"""Fields of version 0.2, each with its name since version 0.3."""
+RENAMED: dict[str, str] = _GONE.pop("renamed")  # Fields of version 0.2, each with its name since version 0.3
 GONE: dict[str, str] = {path: advice for advice, paths in _GONE.items() for path in paths}
 """Fields of version 0.2 that no longer exist, each with what to do instead."""
 _RENAMED_VALUES = {"densification.strategy": {"relocation": "mcmc", "gradient": "adc"}}

@@ -53,8 +53,7 @@ from .values import (
     read_values,
 )
 
-NEW, READY = ".new", ".ready"
-"""A new run while it is written, and while its files take their places."""
+NEW, READY = ".new", ".ready"  # A new run while it is written, and while its files take their places
 _GIVE_RUN = "give the folder that a training wrote"
 _REMOVE_FILE = "remove this file, which a run does not need, or train again"
 _MAKE_AGAIN = "remove this file; `sehdr-warp report` makes it again from the photos"

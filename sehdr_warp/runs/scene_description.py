@@ -17,12 +17,9 @@ from ..scene.photo_names import photo_labels
 from .values import FORMAT
 
 GRID = 8
-_MOST_ROWS = 32
-"""Rows that are read of each row of cells; more would take longer for large photos and find little more."""
-FOUND = "photos", "video"
-"""Layouts of sets whose cameras structure from motion finds."""
-_TOLERANCE = 2
-"""Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded."""
+_MOST_ROWS = 32  # Rows that are read of each row of cells; more would take longer for large photos and find little more
+FOUND = "photos", "video"  # Layouts of sets whose cameras structure from motion finds
+_TOLERANCE = 2  # Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded
 
 
 def describe_scene(scene: Scene) -> dict:

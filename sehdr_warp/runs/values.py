@@ -18,12 +18,10 @@ from ..scene.gravity import LEAST_UNIT, MOST_UNIT
 from ..scene.images.exif import LONGEST, SHORTEST
 from .config_files import field_and_problem
 
-FORMAT = 3
-"""Version of the run folder's format. A reader refuses others."""
+FORMAT = 3  # Version of the run folder's format. A reader refuses others.
 ORIENTATION_FILE = "orientation.json"
 """File in a run's folder that keeps an up direction and a scale set for it; they then need no options."""
-LIGHT_UNIT_FILE = "light_unit.json"
-"""File in a run's folder that keeps the unit of its light."""
+LIGHT_UNIT_FILE = "light_unit.json"  # File in a run's folder that keeps the unit of its light
 REMEDY = "the run is damaged: train again"
 OTHER_VERSION = "train again (train PHOTOS --out THIS_FOLDER --overwrite), or use the version that wrote it"
 _SMALL, _LARGE = 16 << 20, 256 << 20

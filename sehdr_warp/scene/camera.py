@@ -9,12 +9,9 @@ from numpy.typing import ArrayLike
 FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """COLMAP's fisheye models that are radial."""
 PROJECTIONS = ("pinhole", "equirectangular", *FISHEYES)
-MAX_SIDE = 1 << 20
-"""Pixels of a side of an image that can be rendered."""
-MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9
-"""Pixels of a focal length; beyond them single precision cannot project."""
-MAX_DISTANCE = 1e18
-"""Length of the translation of a pose, whose square a float32 must hold."""
+MAX_SIDE = 1 << 20  # Pixels of a side of an image that can be rendered
+MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # Pixels of a focal length; beyond them single precision cannot project
+MAX_DISTANCE = 1e18  # Length of the translation of a pose, whose square a float32 must hold
 _WHOLE = 1 << 53  # Largest number up to which a float of JSON holds every whole number
 
 

@@ -16,14 +16,11 @@ from .dataparser import ImageRecord
 from .images.ldr_files import HDR_SUFFIXES, LDR_SUFFIXES, PHOTO_SUFFIXES
 from .photo_names import fold_name
 
-MASK_FOLDERS = ("masks", "mask", "images_mask")
-"""Folders of masks of a set, in any case."""
-OTHER_FOLDERS = (*MASK_FOLDERS, "hdr", "exr")
-"""Folders of pictures that are not photos."""
+MASK_FOLDERS = ("masks", "mask", "images_mask")  # Folders of masks of a set, in any case
+OTHER_FOLDERS = (*MASK_FOLDERS, "hdr", "exr")  # Folders of pictures that are not photos
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 """Folders of photos, from the full size to reduced copies."""
-LOOKED_FOR = 20
-"""Images of a set by whose names their folder is found."""
+LOOKED_FOR = 20  # Images of a set by whose names their folder is found
 INVERTED_MASK = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which 0 keeps a pixel and every other value leaves it out."""
 # Separators, what Windows forbids, and control characters.

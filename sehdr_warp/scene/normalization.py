@@ -11,10 +11,8 @@ import numpy as np
 from .camera import Camera
 from .types import Scene
 
-MARGIN = 1.1
-"""The unit is this many radii of the training cameras (3DGS: `cameras_extent`)."""
-POINT_SHARE = 0.1
-"""Cameras at one place: the unit is this part of the median distance of the points."""
+MARGIN = 1.1  # The unit is this many radii of the training cameras (3DGS: `cameras_extent`)
+POINT_SHARE = 0.1  # Cameras at one place: the unit is this part of the median distance of the points
 LEAST_SPREAD = 1e-9
 """Cameras that are closer together than this part of their distance from the points count as one place."""
 

@@ -28,8 +28,7 @@ _LARGE = 1 << 14  # Bytes; smaller arrays are pickled
 _ALIGNED = 64
 _ARRAYS = "codes", "mask", "hdr", "light_above_white"
 _LEAST, _MOST_BYTES = 1 << 30, 28  # Of a file, and of a pixel in it: 16-bit codes, a mask, truth, light above white
-SHARE = 0.5
-"""Photos of a scene stay in memory if they take at most this share of what is free."""
+SHARE = 0.5  # Photos of a scene stay in memory if they take at most this share of what is free
 
 
 class _Map(mmap.mmap):

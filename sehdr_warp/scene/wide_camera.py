@@ -15,8 +15,7 @@ import numpy as np
 from .camera import Camera
 from .types import View, codes_of
 
-FACE_ANGLE = 90.0
-"""Degrees that a view cut from a wide photo shows."""
+FACE_ANGLE = 90.0  # Degrees that a view cut from a wide photo shows
 _LEAST_FILLED = 0.3  # Part of a cut view that its photo must show
 WIDEST_PINHOLE = 110.0
 """Degrees: a fisheye lens that sees more keeps its own projection. Undistorted to a pinhole, its border would be lost

@@ -14,13 +14,11 @@ import numpy as np
 from ..errors import NOT_FINITE_REMEDY, InputError
 
 log = logging.getLogger(__name__)
-HARMONIC_0 = 0.5 / math.sqrt(math.pi)
-"""The harmonic of degree 0."""
+HARMONIC_0 = 0.5 / math.sqrt(math.pi)  # The harmonic of degree 0
 MAX_DEGREE = 3
 SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
 """Seconds that a base exposure time may have; beyond, radiance leaves the range of float32."""
-LARGEST_SCALE = 1e6
-"""Largest factor of one export; a file that is exported again has the product of its factors."""
+LARGEST_SCALE = 1e6  # Largest factor of one export; a file that is exported again has the product of its factors
 # A logit beyond this is an opacity of 0 or 1 in float32.
 _MOST_LOGIT = 20.0
 # Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.

@@ -12,8 +12,7 @@ from .arrays import HARMONIC_0, GaussianArrays, degree_of, stated_facts
 from .packing import from_smallest_three, logits, morton_order, smallest_three
 
 SUFFIX = ".compressed.ply"
-MIP = "SplatRenderMode: mip"
-"""Comment of Gaussians that are to be rendered with opacity compensation."""
+MIP = "SplatRenderMode: mip"  # Comment of Gaussians that are to be rendered with opacity compensation
 _CHUNK = 256
 _LIMITS = ("x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b")
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

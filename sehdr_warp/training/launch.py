@@ -21,10 +21,8 @@ import torch.multiprocessing as processes
 from ..caches import package_hash
 from ..errors import InputError, SehdrError
 
-FILE_STORE = "SEHDR_RANKS"
-"""Environment variable with the file through which the ranks of --gpus find each other."""
-_MOST_RANKS = 1 << 14
-"""Processes of a training; the server of the ranks takes memory for each that is announced."""
+FILE_STORE = "SEHDR_RANKS"  # Environment variable with the file through which the ranks of --gpus find each other
+_MOST_RANKS = 1 << 14  # Processes of a training; the server of the ranks takes memory for each that is announced
 GRACE = 5.0  # Seconds that other ranks have to end after one has ended, and again after SIGTERM
 
 

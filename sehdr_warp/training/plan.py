@@ -56,8 +56,7 @@ COMPENSATION = "exposure-compensation"  # Name of the decision that compensation
 UNMEASURED = "not measured"  # Its choice if matched points do not show whether the exposure changed
 LEAST_OVERLAP = 0.02  # Fraction of places shown by two photos, below which poses or photos are wrong
 LEAST_CONTRAST = 1 / 255  # Standard deviation of all encoded values, below which photos show a single color
-CLIPPED = 0.002
-"""Fraction of clipped pixels from which a line says that light above white is an estimate."""
+CLIPPED = 0.002  # Fraction of clipped pixels from which a line says that light above white is an estimate
 DRIFT = 3.0  # Stops of brightness between photos that suggest an exposure that changed without being stated
 
 

@@ -16,14 +16,10 @@ from ..errors import SehdrError
 MOST_CONNECTIONS = 100
 MOST_BYTES = 64 << 20
 """Memory of all answers that are being made and sent; a single answer may be larger if there is no other."""
-SILENCE = 60.0
-"""Seconds that a connection may be open without a request."""
-STALL = 15.0
-"""Seconds that a client may read nothing of its answer."""
-SHORT_STALL = 0.25
-"""The same, if others wait for the room that its answer takes."""
-_ROOM_WAIT = 20.0
-"""Seconds that an answer waits for room."""
+SILENCE = 60.0  # Seconds that a connection may be open without a request
+STALL = 15.0  # Seconds that a client may read nothing of its answer
+SHORT_STALL = 0.25  # The same, if others wait for the room that its answer takes
+_ROOM_WAIT = 20.0  # Seconds that an answer waits for room
 _CHUNK = 1 << 18
 
 

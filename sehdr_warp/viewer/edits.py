@@ -16,8 +16,7 @@ from ..output.world_transform import world_transform, write_orientation
 from ..scene import View
 from ..splats.arrays import HARMONIC_0
 
-MOST_GAIN = 20.0
-"""Largest gain of a light, in stops up or down."""
+MOST_GAIN = 20.0  # Largest gain of a light, in stops up or down
 _HIDDEN_LOGIT = -30.0  # Of an opacity below 1/255, which is not drawn
 
 

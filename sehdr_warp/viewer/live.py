@@ -20,8 +20,7 @@ from .viewer_scene import ViewerScene
 
 log = logging.getLogger(__name__)
 
-SHARE = 0.1
-"""Of the time goes to pictures, at most."""
+SHARE = 0.1  # Of the time goes to pictures, at most
 CURVE_EVERY = 0.5  # Seconds between points of the curves: each reads the loss from the device
 MOST_POINTS = 500
 _WAIT = 0.05

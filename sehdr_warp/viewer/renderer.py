@@ -7,10 +7,8 @@ from concurrent.futures import Future
 from itertools import count
 from typing import Any, NamedTuple
 
-_PIXELS_PER_SECOND = 1_000_000
-"""A picture waits as if it had been asked for later by its pixels over these."""
-_SMALL = 640 * 480
-"""Pixels of a picture that need not wait for the end of a large one, which takes seconds on a CPU."""
+_PIXELS_PER_SECOND = 1_000_000  # A picture waits as if it had been asked for later by its pixels over these
+_SMALL = 640 * 480  # Pixels of a picture that need not wait for the end of a large one, which takes seconds on a CPU
 
 
 class Renderer:

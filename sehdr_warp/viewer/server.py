@@ -37,11 +37,9 @@ from .viewer_scene import ViewerScene, camera_file, camera_of, frame_bytes
 log = logging.getLogger(__name__)
 PORTS_TRIED = 50
 MOST_BODY, MOST_VIEWS = 4 << 20, 2000
-MOST_SAVED = 500_000_000
-"""Pixels of all pictures of a save, about 3 GB; `render` has no such bound."""
+MOST_SAVED = 500_000_000  # Pixels of all pictures of a save, about 3 GB; `render` has no such bound
 MOST_STOPS = 30.0
-_SAVE_END = 30.0
-"""Seconds that the end of the server waits for a save to notice it."""
+_SAVE_END = 30.0  # Seconds that the end of the server waits for a save to notice it
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from ...runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
-LEAST_OPACITY = 1 / 255
-"""Opacity below which 3DGS rasterizers, this one included, draw nothing."""
+LEAST_OPACITY = 1 / 255  # Opacity below which 3DGS rasterizers, this one included, draw nothing
 # Gaussians farther from the cameras than this many times their reach are moved to that distance and shrunk alike: as
 # seen from the middle nothing changes, and from the other cameras it shifts by less than 1/100 rad. Viewers sort by
 # depth over a file's whole extent, so a single stray would cost the rest its order.

@@ -79,8 +79,7 @@ def rgb_channels(image: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip("RGB", np.moveaxis(image, 2, 0), strict=True))
 
 
-PAST_HALF = "float, since half would overflow 65504"
-"""Value of `sehdr:pixelType` where half was asked for."""
+PAST_HALF = "float, since half would overflow 65504"  # Value of `sehdr:pixelType` where half was asked for
 
 
 def check_pixel_type(pixel: str) -> None:

@@ -13,8 +13,7 @@ from ...files import read_bytes, read_text
 from .colorspace import from_rec709
 
 _ROLE = "aces_interchange"
-_LARGEST = 256 << 20
-"""Bytes of a config, and of a LUT."""
+_LARGEST = 256 << 20  # Bytes of a config, and of a LUT
 
 
 def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray], np.ndarray]:

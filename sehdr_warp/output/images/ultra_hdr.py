@@ -11,8 +11,7 @@ import numpy as np
 from ...scene.color.primaries import srgb_to_linear
 from .ldr_files import jpeg, quantize
 
-MOST_STOPS = 5.5
-"""Stops over white that are kept; brighter light is shown at that."""
+MOST_STOPS = 5.5  # Stops over white that are kept; brighter light is shown at that
 QUALITY = 95
 _OFFSET = 1 / 64  # Added to both lights before their ratio, as the format suggests
 _PACKET = (

@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from ...runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
-GREY_CARD = 0.18
-"""Reflectance of a photographer's grey card."""
-EFFICACY = 179.0
-"""Lumens for each watt by which Radiance's files state luminance (its constant WHTEFFICACY)."""
+GREY_CARD = 0.18  # Reflectance of a photographer's grey card
+EFFICACY = 179.0  # Lumens for each watt by which Radiance's files state luminance (its constant WHTEFFICACY)
 _RANGE = 1e-9, 1e12  # cd/m^2 of one unit that can be
 _CLIPPED = 0.1  # Share of clipped values at the reading's place from which its light is an estimate
 

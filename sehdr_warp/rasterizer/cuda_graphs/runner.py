@@ -23,8 +23,7 @@ IDLE_BYTES = 1 << 30
 """If more of torch's memory than this is idle, it is freed before a capture: a graph has memory of its own, and during
 a capture torch can free nothing."""
 
-_one_capture = threading.RLock()
-"""Held during a capture, which switches off the garbage collector of all threads."""
+_one_capture = threading.RLock()  # Held during a capture, which switches off the garbage collector of all threads
 
 
 @contextmanager
@@ -68,8 +67,7 @@ def without_replays() -> Iterator[None]:
         _replays_are_off.reset(token)
 
 
-replays_are_off: Callable[[], bool] = _replays_are_off.get
-"""Return whether this is within without_replays()."""
+replays_are_off: Callable[[], bool] = _replays_are_off.get  # Whether this is within without_replays()
 
 
 _idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}

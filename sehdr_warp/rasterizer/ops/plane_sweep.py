@@ -12,8 +12,7 @@ from ..warp_launch.launching import launch
 
 BORDER = int(plane_sweep.RADIUS)
 """Pixels nearer to the border than this cannot be matched: a patch would leave the photo."""
-NEIGHBORS = plane_sweep.MOST_NEIGHBORS
-"""Largest number of photos that a photo is compared with."""
+NEIGHBORS = plane_sweep.MOST_NEIGHBORS  # Largest number of photos that a photo is compared with
 
 
 @dataclass(frozen=True)

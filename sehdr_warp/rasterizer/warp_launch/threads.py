@@ -23,8 +23,7 @@ from ...kernels import shared_ranges
 from ...parallel import thread_count
 from .loading import launch_object
 
-RANGES_PER_THREAD = 8
-"""Ranges differ in work, so a thread that finishes early takes another one."""
+RANGES_PER_THREAD = 8  # Ranges differ in work, so a thread that finishes early takes another one
 
 _forked = False
 """True if this process was forked from one that had loaded this module: OpenMP's threads are then gone for good."""

@@ -35,8 +35,7 @@ _BT709_GAMMA = 0.50994  # 1 / 1.961, the power that FFmpeg and Apple state for t
 _SAMPLES = 65_536  # Of curves: exact at all codes of 8 and 16 bits
 _PQ_WHITE = 1000.0  # cd/m2 of the code of white, BT.2100's nominal peak; what is brighter is light above white
 _SAME = 0.004  # Linear difference by which curves and primaries may differ and still be sRGB's
-DEVIATION = 0.02
-"""Standard deviation of the logarithm of light that conversion puts above white, by codes of 8 bits."""
+DEVIATION = 0.02  # Standard deviation of the logarithm of light that conversion puts above white, by codes of 8 bits
 _GREY = ("L", "LA", "La", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _INTEROP = 0xA005, 1  # EXIF's interoperability table, and its index
 _COLOR_SPACE = 0xA001

@@ -13,8 +13,7 @@ from ..raw.decode import read_header
 from .ldr_files import HDR_SUFFIXES, JPEG_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
 from .xmp import xmp_of, xmp_values
 
-SHORTEST, LONGEST = 1e-12, 1e12
-"""Seconds: what an exposure time may be."""
+SHORTEST, LONGEST = 1e-12, 1e12  # Seconds: what an exposure time may be
 _LONGEST_EXPOSURE = 86_400  # Seconds that a camera exposes; EXIF's 4294967295 stands for unknown
 _EXIF_IFD = 0x8769
 _CAMERA, _LENS = (271, 272), (42036, 37386, 33437)  # Make and model; lens, focal length, f-number
@@ -26,8 +25,7 @@ StandardOutputSensitivity (EXIF 2.3)."""
 _FLASH = 37385  # Its lowest bit: the flash fired
 _LARGEST_SHORT = 65535
 _UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6}
-_LETTERS = " " + "".join(_UNITS)
-"""Seconds of a unit behind a number, and what may stand there."""
+_LETTERS = " " + "".join(_UNITS)  # Seconds of a unit behind a number, and what may stand there
 _IN_XMP = {
     _EXPOSURE_TIME: "exif:ExposureTime", _SHUTTER_APEX: "exif:ShutterSpeedValue", _F_NUMBER: "exif:FNumber",
     _APERTURE_APEX: "exif:ApertureValue", 34855: "exif:ISOSpeedRatings", 34867: "exifEX:PhotographicSensitivity",

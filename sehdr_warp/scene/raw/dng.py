@@ -35,10 +35,8 @@ _FLOAT = 3  # SampleFormat
 _MOST_JPEG = 1 << 20  # Bytes of a JPEG picture beside six for each of its pixels
 _BIG_HEADS = b"II+\0", b"MM\0+"
 _CONVERT = "convert it with Adobe DNG Converter"
-_MAX_SIDE = 65536
-"""Pixels of the longest side that is read, because a damaged size would fill the memory."""
-_MAX_REPEAT = 64
-"""Rows and columns of the largest pattern of black levels that is read."""
+_MAX_SIDE = 65536  # Pixels of the longest side that is read, because a damaged size would fill the memory
+_MAX_REPEAT = 64  # Rows and columns of the largest pattern of black levels that is read
 
 
 @dataclass(frozen=True)

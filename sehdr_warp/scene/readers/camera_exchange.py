@@ -24,8 +24,7 @@ USD_SIZE = ("sehdr:width", "sehdr:height")
 """Attributes of a UsdGeomCamera that state its picture's size in pixels, which USD itself does not."""
 USD_WORLD_MATRIX = "sehdr:worldMatrix"
 """Entry of a stage's customLayerData: 16 numbers by rows, from the photos' coordinates to the stage's."""
-CHAN_ROTATION = "zxy"
-"""Order of a .chan file's rotations about fixed axes, as Nuke and Blender take it by default."""
+CHAN_ROTATION = "zxy"  # Order of a .chan file's rotations about fixed axes, as Nuke and Blender take it by default
 _SIZE = (1920, 1080)  # Pixels of a camera whose file states none
 _MOST_FRAMES = 100_000
 

@@ -24,8 +24,7 @@ from ..photos import unusable_notes
 from ..unused_files import unread_kinds
 from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model, usual_models
 
-INPUT = "input"
-"""Folder of photos of 3DGS's convert.py, which writes undistorted copies to images/."""
+INPUT = "input"  # Folder of photos of 3DGS's convert.py, which writes undistorted copies to images/
 IMAGES_REMEDY = "copy the images that COLMAP used"
 
 

@@ -22,8 +22,7 @@ from .decode import Clip, codes, decode, grey, in_square_pixels, open_clip
 _log = logging.getLogger("sehdr_warp.scene")
 
 _VERSION = 5
-_STEP = 0.08
-"""Movement between two frames in parts of the width: neighbors overlap by more than nine tenths."""
+_STEP = 0.08  # Movement between two frames in parts of the width: neighbors overlap by more than nine tenths
 _FEWEST, _MOST = 24, 240  # Frames of a clip
 _MOST_OUTSIDE = 1e-3  # Part of a clip's pixels that may lie outside Rec.709 for its photos to be converted to it
 _LEAST_MOVEMENT = 0.05  # In parts of the width, of a whole clip: less shows no depth

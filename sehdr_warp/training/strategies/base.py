@@ -12,8 +12,7 @@ from ...model.gaussians import Gaussians, Optimizer
 from ...rasterizer import Rendering
 from ...runs.config import Config
 
-MIN_INTERVAL = 20
-"""Fewest iterations between refinements, however short the training: statistics need several photos."""
+MIN_INTERVAL = 20  # Fewest iterations between refinements, however short the training: statistics need several photos
 RESERVE_FACTOR = 1.17  # Reserved rows as a multiple of the count: room for three refinements that add a twentieth each
 SEED_STRIDE = 1_000_003  # A step's random seed is that of the training times this, plus the iteration
 
