@@ -50,10 +50,16 @@ def parse_field(path: str, text: str):
     Text that cannot be parsed is returned as it is, so that the validation of the config explains what is allowed.
     """
     kind: Any = dict(config_fields())[path].annotation
-    value = [item for item in map(str.strip, text.split(",")) if item] if get_origin(kind) is tuple else text
+    if get_origin(kind) is tuple:
+        return tuple(_parse(get_args(kind)[0], item) for item in map(str.strip, text.split(",")) if item)
+    return _parse(kind, text)
+
+
+def _parse(kind: Any, text: str) -> Any:
+    """Return text as a value of a type, or as it is."""
     with suppress(ValidationError):
-        return TypeAdapter(kind).validate_python(value)
-    return value
+        return TypeAdapter(kind).validate_python(text)
+    return text
 
 
 def field_text(value) -> str:
