@@ -98,7 +98,7 @@ class Render:
     cameras: str = "test"
     """test, train, all, orbit, interpolate, or your cameras: OpenUSD, .chan, JSON, or a COLMAP model's folder."""
     camera: str | None = None
-    """Only this camera of a file of several, by its name there."""
+    """Only the view of this photo, or this camera of a file of several, by name."""
     count: int | None = None
     """Views of an orbit or interpolation; by default 60, or 144 for a film alone, which are six seconds."""
     size: str | None = None

@@ -77,7 +77,7 @@ def render_views(
         run: From load_run, train or load_splats.
         out: Folder for the files.
         cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
-        camera: Only this camera of a file, by its name there; a moving one with all its frames.
+        camera: Only this photo's view of the run, or this camera of a file, by name; a moving one with all its frames.
         count: Views of an orbit or interpolation.
         evs: Brackets in stops from run.base_time, the photos' median exposure, such as "-4,-2,0" or [-4, -2, 0]. Set
             either evs or exposures.
@@ -187,7 +187,8 @@ def check_options(
         raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
     check_pixel_type(pixel)
     if (ocio is None) != (view is None):
-        raise SehdrError("previews through OpenColorIO need ocio, a config, and view, one of its views")
+        need = "previews through OpenColorIO need --ocio, a config, and view, one of its views"
+        raise SehdrError(f"{need}; --camera chooses the view of a photo")
 
 
 def _camera_files(

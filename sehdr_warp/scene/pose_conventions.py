@@ -21,7 +21,7 @@ from .lens import Lens
 from .shared_pixels import SharedPixels, candidate_pairs, shared_pixels
 
 POSED = ("transforms", "colmap", "llff", "opensfm", "meshroom", "arkit")  # Layouts whose cameras are checked
-MISFIT = "does not fit the photos, by no convention"  # Words of the note on cameras that no reading mends
+MISFIT = "fits the photos by no convention"
 _VERSION = 2  # Raised with every change of results
 _AXES = {  # From a camera's axes to OpenCV's: x right, y down, z ahead
     "OpenCV's": np.eye(3),

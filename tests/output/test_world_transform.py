@@ -325,8 +325,13 @@ def test_several_cameras_are_chosen_from_by_name(tmp_path):
     assert [name for name, _ in select_cameras(run, tmp_path / "c.json", camera="a")] == ["a"]
     with pytest.raises(SehdrError, match="has no camera 'c'"):
         select_cameras(run, tmp_path / "c.json", camera="c")
-    with pytest.raises(SehdrError, match="chooses from a file"):
-        select_cameras(run, "test", camera="a")
+    with pytest.raises(SehdrError, match="chooses a photo or from a file"):
+        select_cameras(run, "orbit", camera="a")
+    photo = run.cameras[-1]
+    for split in ("train", "test", "all"):
+        assert select_cameras(run, split, camera=photo.name) == [(photo.name, photo.camera)]
+    with pytest.raises(SehdrError, match=f"the run has no camera '{photo.name}x', did you mean {photo.name}"):
+        select_cameras(run, "test", camera=f"{photo.name}x")
     assert len(load_cameras(tmp_path / "c.json")) == 5
 
 

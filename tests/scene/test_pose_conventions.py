@@ -247,5 +247,5 @@ def test_poses_that_fit_by_no_convention_are_named(tmp_path, photos, views):
     folder = write_transforms(tmp_path, photos, shuffled, lambda pose: np.linalg.inv(pose) @ FLIP)
     notes = [note for note in parse_dataset(folder, holdout=0).notes if note.startswith("poses: ")]
     assert len(notes) == 1
-    assert "transforms.json does not fit the photos, by no convention" in notes[0]
+    assert "transforms.json fits the photos by no convention" in notes[0]
     assert "give a folder with the photos alone" in notes[0]

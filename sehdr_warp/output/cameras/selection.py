@@ -41,7 +41,7 @@ def select_cameras(
     Args:
         run: From load_run, train or load_splats.
         cameras: "train", "test", "all", "orbit", "interpolate", or a file (see load_cameras).
-        camera: Only this camera of a file.
+        camera: Only this camera of a file, or of the run, whatever its split.
         count: Views of an orbit or interpolation.
         size: Width and height in pixels, or "1920x1080", instead of the cameras' own.
         transform: From the scene's coordinates to those of camera files that other programs write (OpenUSD, .chan); by
@@ -54,9 +54,14 @@ def select_cameras(
     refuse_paths("load_run", run)
     check_cameras(cameras)
     text = str(cameras)
-    if camera is not None and text in SPLITS + PATHS:
-        raise SehdrError(f"--camera {camera}: chooses from a file of cameras, which --cameras {text} is not")
-    if text in SPLITS:
+    if camera is not None and text in PATHS:
+        raise SehdrError(f"--camera {camera}: chooses a photo or from a file of cameras, which --cameras {text} is not")
+    if text in SPLITS and camera is not None:
+        names = [entry.name for entry in run.cameras]
+        if camera not in names:
+            raise SehdrError(f"the run has no camera {camera!r}{did_you_mean(camera, names)}")
+        views = [(entry.name, entry.camera) for entry in run.cameras if entry.name == camera]
+    elif text in SPLITS:
         views = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
         if not views:
             others = ", ".join(word for word in SPLITS + PATHS if word != text)

@@ -45,7 +45,7 @@ def test_what_a_config_lacks_is_named(tmp_path):
     (tmp_path / "raw.ocio").write_text(OCIO.Config.CreateRaw().serialize())
     with pytest.raises(InputError, match="has no role aces_interchange"):
         ocio_view(str(tmp_path / "raw.ocio"), "Raw")
-    with pytest.raises(SehdrError, match="need ocio, a config, and view"):
+    with pytest.raises(SehdrError, match="need ocio, a config, and view.*; camera chooses"):
         render_views(AnalyticRun(), tmp_path / "out", view="Raw")
 
 
