@@ -24,6 +24,7 @@ from ..scene.exposure.compensation import (
     rough_gains,
     unmeasured_reach,
 )
+from ..subsets import counted, first_names
 from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
 from .plan import COMPENSATION, DRIFT, UNMEASURED, Decision
@@ -46,6 +47,7 @@ vignetting, with MAX_REMAINING_VIGNETTING. EXIF rounds
 times and sensitivities, and cameras tone each photo by itself; shiny surfaces and a wrong response explain nothing at
 other points. Ground that is brighter from one side is explained by gains that grow along a flight, but there the
 harmonics represent it."""
+CHANGED_LIGHT = 0.5  # Stops between a photo and what it states, relative to the median photo, from which it is named
 ENOUGH_MATCHES = 0.4  # Fraction of pixels that must match for photos to count as similar in brightness
 MIN_POINTS = 100  # Fewest points for a fit
 
@@ -153,7 +155,8 @@ def estimate_compensation(
     matcher = matcher_of(compensation.parts(**components._asdict()).normalize_photos(small, response))
     matched = match(matcher)
     compensation = fit(matched).parts(**components._asdict())
-    decision = _decision(compensation, components, times_known, _reach_note(views, matched, response))
+    note = _changed_light(compensation, views) * times_known + _reach_note(views, matched, response)
+    decision = _decision(compensation, components, times_known, note)
     return CompensationEstimate(compensation, decision, None)
 
 
@@ -240,6 +243,23 @@ def _reach_note(views: Sequence[View], matched: MatchedPoints, response: Respons
     if not count:
         return ""
     return f"; vignetting of {count} photos is left out: their points reach {reach:.0%} of the way to the corners"
+
+
+def _changed_light(compensation: ExposureCompensation, views: Sequence[View]) -> str:
+    """Return a part of the plan's line that names photos far from what they state; empty if there are none.
+
+    Points do not tell a camera's gain from a change of the light.
+    """
+    stops = np.log2([compensation.gains[view.name][1] for view in views])
+    off = stops - np.median(stops)
+    named = [i for i in np.argsort(-np.abs(off), kind="stable") if abs(off[i]) >= CHANGED_LIGHT]
+    if not named:
+        return ""
+    names = first_names([f"{views[i].name} {off[i]:+.1f}" for i in named])
+    return (
+        f"; {counted(len(named), 'photo is', 'photos are')} brighter or darker than stated (stops: {names}), as where "
+        "clouds pass or a camera brightens by itself"
+    )
 
 
 def _decision(compensation: ExposureCompensation, components: Components, times_known: bool, note: str) -> Decision:
