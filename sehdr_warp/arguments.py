@@ -135,7 +135,8 @@ def positional(options: typing.Any) -> list[str]:
 def _mend_help(options: type) -> None:
     """Join the lines of each option's help, and leave out `(default: None)` and `(default: False)`.
 
-    tyro breaks the help where the source does, and again where the terminal ends.
+    tyro breaks a docstring where the source does, and again where the terminal ends. Help may also be a comment on the
+    option's line.
     """
     for field in dataclasses.fields(options) if dataclasses.is_dataclass(options) else ():
         owner = next(kind for kind in options.__mro__ if field.name in inspect.get_annotations(kind))

@@ -20,14 +20,10 @@ PROGRAM = "sehdr-warp"
 class Command(NamedTuple):
     """Location of a command."""
 
-    module: str
-    """Module below the package."""
-    options: str
-    """Dataclass of its options; the first sentence of its docstring is the command's summary."""
-    run: str
-    """Function that takes the options."""
-    takes_argv: bool = False
-    """True if the function also takes the words of the command line."""
+    module: str  # Module below the package
+    options: str  # Dataclass of its options; the first sentence of its docstring is the command's summary
+    run: str  # Function that takes the options
+    takes_argv: bool = False  # True if the function also takes the words of the command line
 
 
 COMMANDS = {

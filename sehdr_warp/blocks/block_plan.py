@@ -52,16 +52,12 @@ class Block(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=True)
     name: Annotated[str, Field(pattern=r"^block_[0-9]{1,9}$")]
     """Name of the folder of its run, below `blocks/`; it must not lead to another place."""
-    views: list[str]
-    """Names of its views, training and held-out."""
-    fraction: Annotated[float, Field(gt=0, le=1)]
-    """Pixels of its training photos, relative to those of all."""
+    views: list[str]  # Names of its views, training and held-out
+    fraction: Annotated[float, Field(gt=0, le=1)]  # Pixels of its training photos, relative to those of all
     low: Annotated[list[float | None], _THREE]
     """Lower bounds of its core, in the axes of the plan; None for an infinite one."""
-    high: Annotated[list[float | None], _THREE]
-    """Upper bounds of its core."""
-    margin: Annotated[list[FiniteFloat], _THREE]
-    """Enlargement of the core."""
+    high: Annotated[list[float | None], _THREE]  # Upper bounds of its core
+    margin: Annotated[list[FiniteFloat], _THREE]  # Enlargement of the core
 
     @property
     def cell(self) -> Cell:

@@ -19,12 +19,9 @@ if TYPE_CHECKING:
 class Check:
     """Check that this machine renders correctly: stiff and extreme scenes against float64, in seconds."""
 
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    json: Path | None = None
-    """Also write the figures, with a description of this machine, to this file."""
-    overwrite: bool = False
-    """Replace the file of --json."""
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
+    json: Path | None = None  # Also write the figures, with a description of this machine, to this file.
+    overwrite: bool = False  # Replace the file of --json.
 
     removed_flags: ClassVar[dict[str, str]] = {
         "--quick": "every check is quick now",

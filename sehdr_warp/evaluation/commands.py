@@ -22,18 +22,15 @@ log = logging.getLogger(__name__)
 class RunOptions:
     """For a run."""
 
-    data: str | None = None
-    """The photos, if they have moved since the training."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    data: str | None = None  # The photos, if they have moved since the training.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions:
     """For a folder of EXR pictures, scene-linear with Rec.709 primaries and named as the views of the set."""
 
-    truth: str | None = None
-    """The set to compare with: a folder with HDR truth, or an embedded scene."""
+    truth: str | None = None  # The set to compare with: a folder with HDR truth, or an embedded scene.
     max_size: int | None = None
     """Longest side of the truth in pixels, if the pictures are smaller than the set's; the truth is reduced."""
     response: str | None = None
@@ -47,10 +44,8 @@ class ResultOptions:
 
     json: Path | None = None
     """Also write the figures to this file; - prints them on standard output in place of the table."""
-    lpips: Path | None = None
-    """Folder with LPIPS weights; without, LPIPS is null."""
-    overwrite: bool = False
-    """Replace the file of --json."""
+    lpips: Path | None = None  # Folder with LPIPS weights; without, LPIPS is null.
+    overwrite: bool = False  # Replace the file of --json.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,14 +65,10 @@ class Compare:
 
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """Folders of runs, or a folder that holds runs; of these, those without an evaluation yet are left out."""
-    plot: Path | None = None
-    """Also draw held-out error against training time to this PNG file."""
-    csv: Path | None = None
-    """Also write the table to this CSV file."""
-    latex: Path | None = None
-    """Also write the table to this LaTeX file (booktabs)."""
-    overwrite: bool = False
-    """Replace files that exist."""
+    plot: Path | None = None  # Also draw held-out error against training time to this PNG file.
+    csv: Path | None = None  # Also write the table to this CSV file.
+    latex: Path | None = None  # Also write the table to this LaTeX file (booktabs).
+    overwrite: bool = False  # Replace files that exist.
 
 
 def run_evaluate(options: Evaluate) -> None:

@@ -21,10 +21,8 @@ class ViewPixels(NamedTuple):
     prediction: Tensor
     truth: Tensor
     well_exposed: Tensor
-    black: float
-    """Radiance that the photo shows as black, in the unit of the prediction."""
-    max_truth: float
-    """Largest radiance of the truth; 1 if there is no light."""
+    black: float  # Radiance that the photo shows as black, in the unit of the prediction
+    max_truth: float  # Largest radiance of the truth; 1 if there is no light
 
 
 class ErrorRanking:

@@ -47,8 +47,7 @@ class ViewFileOptions:
     """Brackets in stops from the photos' exposure, the median if they differ, such as --evs=-4,-2,0,2,4."""
     exposures: str | None = None
     """Brackets as seconds (1/125), multiples of the photos' exposure (1/8x) or stops from it (-2ev): 1/125,1/30,1x."""
-    multipart: bool = False
-    """One multi-part EXR file for all exposures of a view."""
+    multipart: bool = False  # One multi-part EXR file for all exposures of a view.
     group_by: Literal["view", "exposure"] = "view"
     """Contents of a folder of brackets: all exposures of a view, or the sequence of all views at an exposure."""
     ldr_brackets: Literal["jpeg", "png", "png16"] | None = None
@@ -58,25 +57,20 @@ class ViewFileOptions:
     reference_white: float | None = None
     """Value of display white in hdr/, such as 1, as the photos' middle grey tells it; without it the files hold
     radiance."""
-    pixel: Literal["half", "float"] = "half"
-    """Pixel type of the EXR files."""
-    ocio: str | None = None
-    """OpenColorIO config for the previews: a file, or ocio://default."""
-    view: str | None = None
-    """View of that config, or DISPLAY/VIEW."""
+    pixel: Literal["half", "float"] = "half"  # Pixel type of the EXR files.
+    ocio: str | None = None  # OpenColorIO config for the previews: a file, or ocio://default.
+    view: str | None = None  # View of that config, or DISPLAY/VIEW.
 
 
 @dataclass(frozen=True)
 class FilmOptions:
     """Options of the film that render writes with --video."""
 
-    fps: float = 24.0
-    """Frames a second, also of the camera files of a path."""
+    fps: float = 24.0  # Frames a second, also of the camera files of a path.
     transfer: Literal["sdr", "hlg", "hdr10", "logc3", "slog3", "acescct"] = "sdr"
     """Purpose of the film: any display (H.264), HDR displays (hlg, hdr10: HEVC, 10 bits), or grading (ProRes 4444 in a
     camera's logarithm, .mov)."""
-    ev_ramp: str | None = None
-    """Exposure from the first frame to the last, in stops from the photos': --ev-ramp=-4:4."""
+    ev_ramp: str | None = None  # Exposure from the first frame to the last, in stops from the photos': --ev-ramp=-4:4.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,26 +83,19 @@ class Render:
         "--white": "the option is --reference-white",
     }
 
-    run: Positional[Path]
-    """Folder of a run, or a file of Gaussians."""
-    out: Path | None = None
-    """Folder for the pictures."""
-    video: Path | None = None
-    """A film of the cameras, such as orbit.mp4; without --out no pictures are written."""
+    run: Positional[Path]  # Folder of a run, or a file of Gaussians.
+    out: Path | None = None  # Folder for the pictures.
+    video: Path | None = None  # A film of the cameras, such as orbit.mp4; without --out no pictures are written.
     cameras: str = "test"
     """test, train, all, orbit, interpolate, or your cameras: OpenUSD, .chan, JSON, or a COLMAP model's folder."""
-    camera: str | None = None
-    """Only the view of this photo, or this camera of a file of several, by name."""
+    camera: str | None = None  # Only the view of this photo, or this camera of a file of several, by name.
     count: int | None = None
     """Views of an orbit or interpolation; by default 60, or 144 for a film alone, which are six seconds."""
     size: str | None = None
     """Width and height in pixels, such as 1920x1080; by default the cameras' own, of orbit and interpolate 16:9."""
-    overwrite: bool = False
-    """Replace files that exist."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    json: bool = False
-    """Print the written files as JSON on standard output."""
+    overwrite: bool = False  # Replace files that exist.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
+    json: bool = False  # Print the written files as JSON on standard output.
     world: WorldOptions = WorldOptions()
     pictures: ViewFileOptions = ViewFileOptions()
     film: FilmOptions = FilmOptions()
@@ -201,16 +188,11 @@ def changed_flags(options: Any) -> list[str]:
 class Report:
     """Write report.html: figures, photo, scene and truth side by side, brackets, where it fails; and pictures."""
 
-    run: Positional[Path]
-    """Folder of a run."""
-    out: Path
-    """Folder for the page and the pictures."""
-    data: str | None = None
-    """The photos, if they have moved since the training."""
-    overwrite: bool = False
-    """Replace files that exist."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    run: Positional[Path]  # Folder of a run.
+    out: Path  # Folder for the page and the pictures.
+    data: str | None = None  # The photos, if they have moved since the training.
+    overwrite: bool = False  # Replace files that exist.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
 
 
 def run_report(args: Report) -> None:
@@ -232,15 +214,12 @@ class EnvironmentMap:
 
     removed_flags: ClassVar = {"--fill": "the option is --inpaint", "--white": "the option is --reference-white"}
 
-    run: Positional[Path]
-    """Folder of a run, or a file of Gaussians."""
-    out: Path
-    """The file: .exr, or .hdr without alpha and confidence."""
+    run: Positional[Path]  # Folder of a run, or a file of Gaussians.
+    out: Path  # The file: .exr, or .hdr without alpha and confidence.
     at: str = "center"
     """x,y,z in upright coordinates or those of --axes (0,0,0: what most photos look at), camera:NAME, or center: the
     middle of the training cameras, or what they walk around."""
-    size: int = 2048
-    """Pixels across; for a cube those of one face."""
+    size: int = 2048  # Pixels across; for a cube those of one face.
     layout: Literal["latlong", "cube"] = "latlong"
     """Latitude and longitude, twice as wide as high; or OpenEXR's six faces, one above the other."""
     world: WorldOptions = WorldOptions()
@@ -248,18 +227,14 @@ class EnvironmentMap:
     """Leave out what is nearer than this distance, in the units of --at: a CG object then stands in the place of the
     photographed one. By default 0, or, for the center of a walk around something, half the distance of the nearest
     photo."""
-    inpaint: bool = False
-    """Fill directions that no photo covers with the light around them; alpha still marks them."""
+    inpaint: bool = False  # Fill directions that no photo covers with the light around them; alpha still marks them.
     colorspace: str = "rec709"
     """Primaries, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
     reference_white: float | None = None
     """Value of display white in the file, such as 1, which suits a dome light; without it the file holds radiance."""
-    pixel: Literal["half", "float"] = "half"
-    """Pixel type of an EXR file."""
-    overwrite: bool = False
-    """Replace a file that exists."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    pixel: Literal["half", "float"] = "half"  # Pixel type of an EXR file.
+    overwrite: bool = False  # Replace a file that exists.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
 
 
 def run_environment_map(args: EnvironmentMap) -> None:
@@ -288,23 +263,19 @@ class Lights:
     A USD file holds a SphereLight or RectLight for each, and a DomeLight for everything else.
     """
 
-    run: Positional[Path]
-    """Folder of a run."""
+    run: Positional[Path]  # Folder of a run.
     out: Path | None = None
     """The file: .json, or .usda, with a map of the rest beside it. Without it the lights are only listed."""
     world: WorldOptions = WorldOptions()
     at: str = "center"
     """Place that is lit, as of envmap: that of a CG object. Lights that something hides from it are dimmer."""
-    beyond: float | None = None
-    """Leave out what is nearer than this, as in envmap."""
+    beyond: float | None = None  # Leave out what is nearer than this, as in envmap.
     unseen: Literal["inpaint", "black"] = "inpaint"
     """inpaint: directions of the map that no photo covers get the light around them; alpha still marks them."""
     reference_white: float | None = None
     """The one that the plates were rendered with, if any: lights and map then have their units."""
-    overwrite: bool = False
-    """Replace files that exist."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    overwrite: bool = False  # Replace files that exist.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
 
 
 def run_lights(args: Lights) -> None:
@@ -335,20 +306,13 @@ class Meter:
     Pictures and environment maps then state cd/m^2, and lights are written in cd/m^2.
     """
 
-    run: Positional[Path]
-    """Folder of a run."""
-    view: str | None = None
-    """View in which the reading was taken. Without it, the unit of the run is printed."""
-    pixel: str | None = None
-    """x,y of the place from the upper left corner, in the size that the run has the view in."""
-    luminance: float | None = None
-    """Reading of a spot meter there, in cd/m^2."""
-    illuminance: float | None = None
-    """Reading of a lux meter on a matte surface there, such as a grey card."""
-    reflectance: float = 0.18
-    """Reflectance of that surface."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    run: Positional[Path]  # Folder of a run.
+    view: str | None = None  # View in which the reading was taken. Without it, the unit of the run is printed.
+    pixel: str | None = None  # x,y of the place from the upper left corner, in the size that the run has the view in.
+    luminance: float | None = None  # Reading of a spot meter there, in cd/m^2.
+    illuminance: float | None = None  # Reading of a lux meter on a matte surface there, such as a grey card.
+    reflectance: float = 0.18  # Reflectance of that surface.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
 
 
 def run_meter(args: Meter) -> None:

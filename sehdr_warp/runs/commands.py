@@ -12,20 +12,16 @@ from . import config_files as configs
 class Presets:
     """List the presets: what each is for, and what it costs."""
 
-    json: bool = False
-    """Print them as JSON."""
+    json: bool = False  # Print them as JSON.
 
 
 @dataclass(frozen=True)
 class ShowConfig:
     """Print the whole config of a preset or a run, with the meaning of every field, as a TOML file."""
 
-    which: Positional[str] = "default"
-    """A preset, a TOML file, or the folder of a run."""
-    diff: bool = False
-    """Only what differs from the default preset: a file that --preset takes."""
-    json: bool = False
-    """Print it as JSON."""
+    which: Positional[str] = "default"  # A preset, a TOML file, or the folder of a run.
+    diff: bool = False  # Only what differs from the default preset: a file that --preset takes.
+    json: bool = False  # Print it as JSON.
 
 
 def run_presets(args: Presets) -> None:

@@ -13,32 +13,26 @@ from tyro.conf import Positional
 class Scenes:
     """List the scenes that come with the package or a checkout of it, for train and load_scene."""
 
-    json: bool = False
-    """Print them as JSON."""
+    json: bool = False  # Print them as JSON.
 
 
 @dataclass(frozen=True)
 class Responses:
     """List the camera responses that have a name, and what each is for."""
 
-    json: bool = False
-    """Print them as JSON."""
+    json: bool = False  # Print them as JSON.
 
 
 @dataclass(frozen=True)
 class Calibrate:
     """Measure a camera's response from an exposure stack: photos of one still scene at several exposure times."""
 
-    stack: Positional[Path]
-    """Folder of photos; their times come from EXIF, exposures.json or --exposures."""
-    out: Path
-    """CSV file for the curve, for --response; a plot goes beside it (.png)."""
-    exposures: str | None = None
-    """Times in the order of the files' names, such as 1/500,1/125,1/30."""
+    stack: Positional[Path]  # Folder of photos; their times come from EXIF, exposures.json or --exposures.
+    out: Path  # CSV file for the curve, for --response; a plot goes beside it (.png).
+    exposures: str | None = None  # Times in the order of the files' names, such as 1/500,1/125,1/30.
     channel: Literal["red", "green", "blue", "each"] | None = None
     """One channel alone, or a curve for each; by default one curve for all three."""
-    overwrite: bool = False
-    """Replace files that exist."""
+    overwrite: bool = False  # Replace files that exist.
 
 
 def run_scenes(args: Scenes) -> None:

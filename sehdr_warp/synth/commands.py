@@ -16,22 +16,15 @@ LOG = logging.getLogger(__name__)
 class Synth:
     """Write the photos of HDR truth through a camera response, as an HDR-NeRF synthetic set."""
 
-    truth: tyro.conf.Positional[str]
-    """A set with truth, or `embedded` or `embedded:NAME`."""
-    out: Path
-    """Folder for the set."""
-    response: str = "hdr-nerf"
-    """Camera response: a name (srgb, gamma-2.2, hdr-nerf ...) or a file."""
+    truth: tyro.conf.Positional[str]  # A set with truth, or `embedded` or `embedded:NAME`.
+    out: Path  # Folder for the set.
+    response: str = "hdr-nerf"  # Camera response: a name (srgb, gamma-2.2, hdr-nerf ...) or a file.
     exposures: str | None = None
     """Times in seconds, such as 1/50,0.08,0.32; by default five, four times apart, around a well exposed one."""
-    glare: float = 0.0
-    """Veiling glare index of the lens in percent (ISO 9358); real lenses have 0.5 to 3."""
-    noise: str | None = None
-    """Sensor noise as FULL_WELL,READ_NOISE in electrons, such as 20000,5; by default none."""
-    seed: int = 0
-    """Seed of the noise."""
-    overwrite: bool = False
-    """Replace the folder if it exists."""
+    glare: float = 0.0  # Veiling glare index of the lens in percent (ISO 9358); real lenses have 0.5 to 3.
+    noise: str | None = None  # Sensor noise as FULL_WELL,READ_NOISE in electrons, such as 20000,5; by default none.
+    seed: int = 0  # Seed of the noise.
+    overwrite: bool = False  # Replace the folder if it exists.
 
 
 def run_synth(args: Synth) -> None:

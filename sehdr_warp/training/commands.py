@@ -36,12 +36,10 @@ class SceneOptions:
 
     response: str | None = None
     """Camera response: a name of `sehdr-warp responses`, a file, auto (the default) or learned."""
-    max_size: int | None = None
-    """Longest side of the photos, in pixels; larger ones are reduced."""
+    max_size: int | None = None  # Longest side of the photos, in pixels; larger ones are reduced.
     holdout: int | None = None
     """Hold out every Nth view for testing, 0 none; by default what the set states, or every 8th."""
-    exposure_index: int | None = None
-    """Which exposure to take where a view has several; by default the middle one."""
+    exposure_index: int | None = None  # Which exposure to take where a view has several; by default the middle one.
 
 
 @dataclass(frozen=True)
@@ -50,44 +48,31 @@ class TrainingOptions:
 
     preset: str | None = None
     """A name of `sehdr-warp presets` or a TOML file. (default: default, or what --resume continues)"""
-    iterations: int | None = None
-    """Steps; by default planned from the photos."""
-    seed: int | None = None
-    """Seed of every random number."""
-    blocks: str | None = None
-    """Train in N blocks of space, merged; auto chooses N."""
-    plan_only: bool = False
-    """Print the plan and its cost; train nothing."""
+    iterations: int | None = None  # Steps; by default planned from the photos.
+    seed: int | None = None  # Seed of every random number.
+    blocks: str | None = None  # Train in N blocks of space, merged; auto chooses N.
+    plan_only: bool = False  # Print the plan and its cost; train nothing.
 
 
 @dataclass(frozen=True)
 class OutputOptions:
     """"""  # noqa: D419
 
-    out: Path | None = None
-    """Folder for the run."""
-    resume: bool = False
-    """Continue the run in --out, with its scene and config."""
-    overwrite: bool = False
-    """Replace the run in --out."""
-    tensorboard: bool = False
-    """Write TensorBoard event files into the run."""
-    view: bool = False
-    """Serve the page of `view` during the training, from port 8080."""
-    json: bool = False
-    """Print the result as JSON on standard output."""
+    out: Path | None = None  # Folder for the run.
+    resume: bool = False  # Continue the run in --out, with its scene and config.
+    overwrite: bool = False  # Replace the run in --out.
+    tensorboard: bool = False  # Write TensorBoard event files into the run.
+    view: bool = False  # Serve the page of `view` during the training, from port 8080.
+    json: bool = False  # Print the result as JSON on standard output.
 
 
 @dataclass(frozen=True)
 class MachineOptions:
     """"""  # noqa: D419
 
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    gpus: int = 1
-    """GPUs, for one training or for blocks."""
-    slurm: str | None = None
-    """Submit blocks to SLURM: partition=gpu,time=MINUTES."""
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
+    gpus: int = 1  # GPUs, for one training or for blocks.
+    slurm: str | None = None  # Submit blocks to SLURM: partition=gpu,time=MINUTES.
 
 
 @dataclass(frozen=True)

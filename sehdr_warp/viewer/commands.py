@@ -20,16 +20,12 @@ class View:
 
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """Folders of runs, or files of Gaussians; with several, the page compares them."""
-    port: int = 8080
-    """Port; the next free one where it is taken."""
-    host: str = "127.0.0.1"
-    """Address to serve: this machine alone, or 0.0.0.0 for all that can reach it."""
+    port: int = 8080  # Port; the next free one where it is taken.
+    host: str = "127.0.0.1"  # Address to serve: this machine alone, or 0.0.0.0 for all that can reach it.
     origin: tuple[str, ...] = ()
     """Address of a proxy before the viewer, such as https://splats.example.org, whose pages may ask it."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
-    data: str | None = None
-    """The photos, if they have moved since the training."""
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
+    data: str | None = None  # The photos, if they have moved since the training.
 
 
 def run_view(args: View) -> None:

@@ -24,8 +24,7 @@ _HIDDEN_LOGIT = -30.0  # Of an opacity below 1/255, which is not drawn
 class EditedOpacities:
     """Hides Gaussians of a model by their opacities, so that a preview needs no copy of the scene."""
 
-    original: Tensor | None = None
-    """[N] logits before the first edit; None if nothing is hidden."""
+    original: Tensor | None = None  # [N] logits before the first edit; None if nothing is hidden
 
     @torch.no_grad()
     def apply(self, run: Any, edits: SplatEdits | None) -> int:

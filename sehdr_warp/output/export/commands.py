@@ -26,8 +26,7 @@ class SplatFileOptions:
     ldr."""
     exposure: str | None = None
     """Exposure of ldr colors: seconds (1/125), stops from the photos' exposure (-2ev) or multiples of it (1/8x)."""
-    degree: int | None = None
-    """Pad the harmonics with zeros up to this degree, for readers that take 3 alone."""
+    degree: int | None = None  # Pad the harmonics with zeros up to this degree, for readers that take 3 alone.
 
 
 @dataclass(frozen=True)
@@ -37,16 +36,11 @@ class EditOptions:
     crop: str | None = None
     """Keep only this region, in upright coordinates or those of --axes: sphere:x,y,z,radius or
     box:x0,y0,z0,x1,y1,z1."""
-    cut: str | None = None
-    """Leave this region out, written as that of --crop."""
-    min_opacity: float = 1 / 255
-    """Least opacity; below 1/255 no program draws a Gaussian."""
-    min_views: int = 0
-    """Leave out what fewer training cameras show: 2 removes most floaters."""
-    mask_only: bool = False
-    """Keep only what the masks of the photos show white; masks of a few photos are enough."""
-    data: str | None = None
-    """The photos with these masks, if they have moved since the training."""
+    cut: str | None = None  # Leave this region out, written as that of --crop.
+    min_opacity: float = 1 / 255  # Least opacity; below 1/255 no program draws a Gaussian.
+    min_views: int = 0  # Leave out what fewer training cameras show: 2 removes most floaters.
+    mask_only: bool = False  # Keep only what the masks of the photos show white; masks of a few photos are enough.
+    data: str | None = None  # The photos with these masks, if they have moved since the training.
     max_gaussians: int | None = None
     """Keep this many, those that pictures show most, and fit their colors again: a small file to share."""
 
@@ -55,58 +49,45 @@ class EditOptions:
 class Export:
     """Write the Gaussians as a file for viewers and other tools, or as a page that shows them in HDR."""
 
-    run: Positional[Path]
-    """Folder of a run, or a file of Gaussians."""
+    run: Positional[Path]  # Folder of a run, or a file of Gaussians.
     out: Path
     """The file; its suffix decides: .ply, .glb (glTF), .usda, .usdc or .usdz (OpenUSD), .html (a page to send), or the
     small ones .sog, .spz and .compressed.ply. FOLDER/lod-meta.json is streamed SOG: chunks of a large scene."""
     world: WorldOptions = field(default_factory=WorldOptions)
     edits: EditOptions = EditOptions()
-    merge: tuple[Path, ...] = ()
-    """Further runs or files in the same coordinates, which the file holds as well."""
+    merge: tuple[Path, ...] = ()  # Further runs or files in the same coordinates, which the file holds as well.
     file: SplatFileOptions = SplatFileOptions()
     cameras: bool = False
     """Also write the cameras beside it (scene.ply.cameras.json), in the form of the reference release of 3D Gaussian
     Splatting."""
-    overwrite: bool = False
-    """Replace files that exist."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    overwrite: bool = False  # Replace files that exist.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
     """Turn a file of Gaussians into one of another kind."""
 
-    source: Positional[Path]
-    """The file: .ply, .glb, .usda, .usdc, .usdz, .sog, .spz or .compressed.ply."""
-    out: Positional[Path]
-    """The file to write; its suffix decides."""
+    source: Positional[Path]  # The file: .ply, .glb, .usda, .usdc, .usdz, .sog, .spz or .compressed.ply.
+    out: Positional[Path]  # The file to write; its suffix decides.
     file: SplatFileOptions = SplatFileOptions()
-    overwrite: bool = False
-    """Replace a file that exists."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    overwrite: bool = False  # Replace a file that exists.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh:
     """Write a mesh of a scene's surfaces: to catch shadows, to collide, to hide what is behind."""
 
-    run: Positional[Path]
-    """Folder of a run."""
-    out: Path
-    """The file: .usda or .usdc (OpenUSD) or .obj."""
+    run: Positional[Path]  # Folder of a run.
+    out: Path  # The file: .usda or .usdc (OpenUSD) or .obj.
     world: WorldOptions = field(default_factory=WorldOptions)
     crop: str | None = None
     """Mesh only this region, in upright coordinates or those of --axes: sphere:x,y,z,radius or
     box:x0,y0,z0,x1,y1,z1."""
-    resolution: int = 160
-    """Voxels along the longest side; memory grows with its cube."""
-    overwrite: bool = False
-    """Replace a file that exists."""
-    device: str | None = None
-    """cpu or cuda:N; by default the first GPU if there is one."""
+    resolution: int = 160  # Voxels along the longest side; memory grows with its cube.
+    overwrite: bool = False  # Replace a file that exists.
+    device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
 
 
 def run_mesh(args: Mesh) -> None:
