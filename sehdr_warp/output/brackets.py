@@ -35,8 +35,7 @@ log = logging.getLogger(__name__)
 LDR_FORMATS = ("jpeg", "png", "png16")
 MANIFEST_FORMAT = 1
 
-# EXIF rationals and 32-bit expTime hold these; real shutters lie far inside.
-_SHORTEST, _LONGEST = 1e-6, 1e6
+_SHORTEST, _LONGEST = 1e-6, 1e6  # EXIF rationals and 32-bit expTime hold these; real shutters lie far inside
 
 
 def bracket_exposures(

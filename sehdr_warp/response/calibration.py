@@ -11,8 +11,7 @@ from .table import TabulatedResponse
 # 8-bit codes outside of this range are clipped or nearly so, and are not used.
 DARKEST, BRIGHTEST = 3, 252
 CHANNELS = ("red", "green", "blue")
-# Weight of the squared second derivative of the curve against the mean weight of a code.
-_SMOOTHNESS = 0.02
+_SMOOTHNESS = 0.02  # Weight of the squared second derivative of the curve against the mean weight of a code
 # Residuals in stops from which a sample counts less (movement, noise), rounds of reweighting, and the median residual
 # from which photos cannot be of one still scene: a curve is right if most samples agree, whatever the others do.
 _OUTLIER, _ROUNDS, _MISALIGNED = 0.1, 4, 0.2

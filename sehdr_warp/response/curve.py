@@ -11,8 +11,7 @@ import torch
 
 from ..errors import SehdrError
 
-# An encoded value nearer to white than this is stored as 255.
-HALF_CODE = 0.5 / 255
+HALF_CODE = 0.5 / 255  # An encoded value nearer to white than this is stored as 255
 # Rise of encode_extended beyond the clip point for each factor of e in exposure: a tenth of a gamma curve's just below
 # white, enough for a gradient.
 EXTENSION_SLOPE = 0.05

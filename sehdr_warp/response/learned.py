@@ -11,8 +11,7 @@ from ..errors import SehdrError
 from ..rasterizer.ops.interpolation import interpolate
 from .curve import HALF_CODE, Response
 
-# Added to exposures before the logarithm: a hundredth of 8-bit black in sRGB.
-EXPOSURE_FLOOR = 1e-6
+EXPOSURE_FLOOR = 1e-6  # Added to exposures before the logarithm: a hundredth of 8-bit black in sRGB
 # The table from which many exposures are encoded, in their logarithm; below it f is constant, above straight. Fewer
 # than EXACT_BELOW are encoded without it.
 LOG_RANGE, LOG_NODES, EXACT_BELOW = (-20.0, 12.0), 2048, 4096

@@ -14,8 +14,7 @@ DENSE_SAMPLES = 256
 CELLS_PER_OCTAVE, TOE_OCTAVES, MAX_OCTAVES = 512, 6, 40
 # A flat part is tilted by this much over its length (1/64 of an 8-bit code), so that the curve has an inverse there.
 FLAT_TILT = 2.0**-14
-# A rise from sample to sample below this does not count: a 16-bit code is 1.5e-5.
-LEAST_STEP = 1e-9
+LEAST_STEP = 1e-9  # A rise from sample to sample below this does not count: a 16-bit code is 1.5e-5
 
 
 class TabulatedResponse(Response, kind="table"):

@@ -23,8 +23,7 @@ IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 LOOKED_FOR = 20  # Images of a set by whose names their folder is found
 INVERTED_MASK = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which 0 keeps a pixel and every other value leaves it out."""
-# Separators, what Windows forbids, and control characters.
-_FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
+_FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # Separators, what Windows forbids, and control characters
 _LONGEST = 120  # Bytes of a name, which get prefixes and suffixes; most file systems take 255
 
 

@@ -19,8 +19,7 @@ MAX_DEGREE = 3
 SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e12
 """Seconds that a base exposure time may have; beyond, radiance leaves the range of float32."""
 LARGEST_SCALE = 1e6  # Largest factor of one export; a file that is exported again has the product of its factors
-# A logit beyond this is an opacity of 0 or 1 in float32.
-_MOST_LOGIT = 20.0
+_MOST_LOGIT = 20.0  # A logit beyond this is an opacity of 0 or 1 in float32
 # Sizes are drawn within e^-20 to e^20 scene units; further ones would overflow where files hold sizes themselves.
 _MOST_LOG_SCALE = 20.0
 _LEAST_VARIANCE = 1e-6  # Part of a size's variance that remains without the filter, where float32 holds no less

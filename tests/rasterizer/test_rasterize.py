@@ -9,8 +9,7 @@ from sehdr_warp.rasterizer.reference import rasterize_reference
 from .scenes import finite_differences, random_like, random_scene, relative_error
 
 NAMES = ("means", "log_scales", "quaternions", "opacities", "features", "world_to_camera", "intrinsics")
-# Largest relative error in norm: value, gradient.
-BOUNDS = {torch.float64: (1e-12, 1e-11), torch.float32: (1e-5, 1e-4)}
+BOUNDS = {torch.float64: (1e-12, 1e-11), torch.float32: (1e-5, 1e-4)}  # Largest relative error in norm: value, gradient
 
 
 def backward(rendering):

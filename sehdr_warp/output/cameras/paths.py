@@ -10,8 +10,7 @@ from ...scene import Camera
 from ...scene.gravity import looks_down, up_direction
 from .scene_cameras import camera_axes, camera_positions, common_focus, is_full_circle
 
-# More than an hour of film at 24 views a second is a slip of the hand.
-_LONGEST = 100_000
+_LONGEST = 100_000  # More than an hour of film at 24 views a second is a slip of the hand
 # Cosine between the step from a photo to the next and their optical axes. A walk ahead has a median near 1, walks
 # around something, along it and flights 0 to 0.3.
 _AHEAD, _ASIDE = 0.7, 0.3

@@ -13,8 +13,7 @@ from ...subsets import first_names
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene
 
-# A gap in azimuth smaller than this means that the photos go round the scene.
-_ROUND_GAP = np.radians(120)
+_ROUND_GAP = np.radians(120)  # A gap in azimuth smaller than this means that the photos go round the scene
 # Mean squared sine between optical axes below which they are parallel in effect: where they meet is then chance, as of
 # photos from the air that look down (6 degrees).
 _PARALLEL = np.sin(np.radians(6)) ** 2

@@ -12,10 +12,8 @@ import numpy as np
 
 from .display import MIDDLE_GREY, encode_srgb
 
-# ITU-R BT.709 luminance weights.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-# Below this part of the brightest per cent, a pixel says nothing about the scene's key.
-_FLOOR = 1e-6
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # ITU-R BT.709 luminance weights
+_FLOOR = 1e-6  # Below this part of the brightest per cent, a pixel says nothing about the scene's key
 # Reinhard 2003 uses the extremes; percentiles keep a lamp's filament from deciding the picture.
 _LOW, _HIGH, _WHITE = 1.0, 99.0, 99.8
 

@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 
 from ...kernels.clipped_light import clipped_light_kernel, clipped_light_patch_kernel, clipped_logarithms_kernel
-from ..gradients import scale_gradient
-from ..torch_contract import once_differentiable
 from ..warp_launch.launching import launch, warp_scalar
 from . import patches
 from .code_residual import CODES, WHITE, CodeScale, check_codes, photo_stack, residual
@@ -52,29 +50,16 @@ def photo_loss(
     takes them.
     """
     check_codes(image, codes, scale, index)
-    weights = distance_weight, dissimilarity_weight
-    return _PhotoLoss.apply(image, codes, scale, index, weights, clipped, estimates)
 
-
-class _PhotoLoss(torch.autograd.Function):
-    """The forward pass also computes the gradient; the backward pass multiplies it by that of the loss."""
-
-    @staticmethod
-    def forward(ctx, image, codes, scale, index, weights, clipped, estimates):
-        image = image.detach().contiguous()
+    def compute(image: Tensor, needs_gradient: bool) -> tuple[Tensor, Tensor | None]:
         prediction, target, slopes = residual(image, codes, scale, index)
-        terms, gradient = distance_terms(
-            prediction, target, *weights, needs_gradient=ctx.needs_input_grad[0], slopes=slopes
-        )
+        weights = distance_weight, dissimilarity_weight
+        terms, gradient = distance_terms(prediction, target, *weights, needs_gradient, slopes)
         if clipped:
             add_clipped_light(image, codes, scale.white, clipped, index, None, estimates, terms, gradient)
-        ctx.save_for_backward(*(() if gradient is None else (gradient,)))
-        return patches.total(terms)
+        return terms, gradient
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, upstream):
-        return scale_gradient(ctx.saved_tensors[0], upstream), None, None, None, None, None, None
+    return patches.loss_of(image, compute)
 
 
 def clipped_light_energy(
@@ -104,7 +89,13 @@ def clipped_light_energy(
         estimates: [h, w, 6] float16 for the same picture, sampled at the nearest place: for each channel the expected
             v, and then 1 / its deviation, 0 where nothing is known.
     """
-    return _ClippedLight.apply(image, codes, white, weights, index, mask, estimates)
+
+    def compute(image: Tensor, needs_gradient: bool) -> tuple[Tensor, Tensor | None]:
+        terms, gradient = patches.new_terms(image).zero_(), torch.zeros_like(image) if needs_gradient else None
+        add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, gradient)
+        return terms, gradient
+
+    return patches.loss_of(image, compute)
 
 
 def add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, gradient) -> None:
@@ -128,19 +119,3 @@ def add_clipped_light(image, codes, white, weights, index, mask, estimates, term
     logarithms = torch.empty_like(image)
     launch(clipped_logarithms_kernel(scalar, code), image.numel(), *photo, logarithms)
     launch(clipped_light_kernel(scalar), image.numel(), image, logarithms, white, *energy)
-
-
-class _ClippedLight(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, image, codes, white, weights, index, mask, estimates):
-        image = image.detach().contiguous()
-        terms, gradient = patches.new_terms(image).zero_(), torch.zeros_like(image)
-        add_clipped_light(image, codes, white, weights, index, mask, estimates, terms, gradient)
-        ctx.save_for_backward(gradient)
-        return patches.total(terms)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad_energy):
-        (gradient,) = ctx.saved_tensors
-        return scale_gradient(gradient, grad_energy), None, None, None, None, None, None

@@ -8,7 +8,7 @@ from torch import Tensor
 from ...kernels.ssim import RADIUS, ssim_kernels, window
 from ...kernels.ssim_cuda import ssim_patch_kernels
 from ..checks import check_memory, check_tensors
-from ..gradients import constant, scale_gradient, unit_gradient
+from ..gradients import constant, unit_gradient
 from ..torch_contract import once_differentiable, torch_operation
 from ..warp_launch.launching import launch, warp_scalar
 from . import patches
@@ -49,22 +49,9 @@ def image_distance(a: Tensor, b: Tensor, distance_weight: float, dissimilarity_w
 
     Takes one launch more than ssim(). Differentiable once with respect to a. a, b: as of ssim(), with its errors.
     """
-    return _Distance.apply(a, b, distance_weight, dissimilarity_weight)
-
-
-class _Distance(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, a, b, distance_weight, dissimilarity_weight):
-        _check(a, b)
-        a, b = a.detach().contiguous(), b.detach().contiguous()
-        terms, gradient = distance_terms(a, b, distance_weight, dissimilarity_weight, ctx.needs_input_grad[0])
-        ctx.save_for_backward(*(() if gradient is None else (gradient,)))
-        return patches.total(terms)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, upstream):
-        return scale_gradient(ctx.saved_tensors[0], upstream), None, None, None
+    _check(a, b)
+    other, weights = b.detach().contiguous(), (distance_weight, dissimilarity_weight)
+    return patches.loss_of(a, lambda image, needs_gradient: distance_terms(image, other, *weights, needs_gradient))
 
 
 def distance_terms(
