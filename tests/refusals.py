@@ -5,25 +5,25 @@ import pytest
 from sehdr_warp import cli
 
 
-def call(*arguments):
+def call(*arguments, main=cli.main):
     """Exit status of a command line in this process."""
     with pytest.raises(SystemExit) as caught:
-        cli.main([str(argument) for argument in arguments])
+        main([str(argument) for argument in arguments])
     return caught.value.code
 
 
-def error_line(capfd) -> str:
+def error_line(capfd, program="sehdr-warp") -> str:
     """The one line on standard error, native libraries' included."""
     lines = capfd.readouterr().err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("sehdr-warp: ") and len(lines[0]) < 700, lines
+    assert len(lines) == 1 and lines[0].startswith(f"{program}: ") and len(lines[0]) < 700, lines
     return lines[0]
 
 
-def refused(capfd, *arguments) -> str:
+def refused(capfd, *arguments, main=cli.main, program="sehdr-warp") -> str:
     """The error of a command line that must fail with status 1 and one line."""
     capfd.readouterr()
-    assert call(*arguments, "-q") == 1
-    return error_line(capfd)
+    assert call(*arguments, "-q", main=main) == 1
+    return error_line(capfd, program)
 
 
 def train_refused(capfd, data, *flags) -> str:
