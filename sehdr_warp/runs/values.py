@@ -45,21 +45,13 @@ class Values(BaseModel):
 
 
 class LoadArguments(TypedDict, total=False):
-    """Arguments of load_scene() that a run saves in run.json, so that its photos can be loaded again.
+    """Arguments of load_scene() that a run saves in run.json, so that its photos can be loaded again."""
 
-    Attributes:
-        path: Where the photos are: a folder, a video, or "embedded"; None or left out if that is not known.
-        exposure_index: As in load_scene().
-        max_size: As in load_scene().
-        holdout: As in load_scene().
-        views: Names of the views to read, if only some are.
-    """
-
-    path: str | None
-    exposure_index: int | None
-    max_size: int | None
-    holdout: int | None
-    views: list[str]
+    path: str | None  # Where the photos are: a folder, a video, or "embedded"; None or left out if that is not known
+    exposure_index: int | None  # As in load_scene()
+    max_size: int | None  # As in load_scene()
+    holdout: int | None  # As in load_scene()
+    views: list[str]  # Names of the views to read, if only some are
 
 
 SCENE_OPTIONS = ("exposure_index", "max_size", "holdout")

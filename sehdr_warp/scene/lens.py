@@ -34,22 +34,15 @@ _LEAST_FOCAL = 0.02  # Of the longer side; the widest fisheye lenses have 0.13
 class Lens:
     """A camera's intrinsics as a data set states them.
 
-    Attributes:
-        model: one of CAMERA_MODELS.
-        width: of the images that params refer to, in pixels.
-        height: of the images that params refer to, in pixels.
-        params: in COLMAP's order; the centre of the top left pixel is (0.5, 0.5).
-        source: the file that states them.
-
     Raises:
         InputError: for an unknown model, a wrong number of parameters, a size outside 1..65536 or bad values.
     """
 
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-    source: Path
+    model: str  # One of CAMERA_MODELS
+    width: int  # Of the images that params refer to, in pixels
+    height: int  # Of the images that params refer to, in pixels
+    params: tuple[float, ...]  # In COLMAP's order; the centre of the top left pixel is (0.5, 0.5)
+    source: Path  # The file that states them
 
     def __post_init__(self):
         """Check the values."""

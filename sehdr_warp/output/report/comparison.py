@@ -21,32 +21,19 @@ _LEAST_BRIGHTER = 0.001  # Share of a picture that shows light above white
 
 @dataclass(frozen=True)
 class Comparison:
-    """A view beside its photo; pictures are [H, W, 3] radiance unless stated.
+    """A view beside its photo; pictures are [H, W, 3] radiance unless stated."""
 
-    Attributes:
-        name: Of the view.
-        photo: Encoded values in [0, 1].
-        from_photo: Radiance that the photo alone gives, its response inverted.
-        hdr: Rendered radiance.
-        exposure_time: Seconds of the photo.
-        gain: Of its response, see display_gain.
-        truth: HDR truth in the scale of `hdr`, if the scene has it.
-        confidence: [H, W] in [0, 1] of the render, if it was measured.
-        new: Rendered half-way to the nearest other view, if there is one.
-        alpha, new_alpha: [H, W] coverage of `hdr` and `new`.
-    """
-
-    name: str
-    photo: np.ndarray
-    from_photo: np.ndarray
-    hdr: np.ndarray
-    exposure_time: float
-    gain: float
-    truth: np.ndarray | None = None
-    confidence: np.ndarray | None = None
-    new: np.ndarray | None = None
-    alpha: np.ndarray | None = None
-    new_alpha: np.ndarray | None = None
+    name: str  # Of the view
+    photo: np.ndarray  # Encoded values in [0, 1]
+    from_photo: np.ndarray  # Radiance that the photo alone gives, its response inverted
+    hdr: np.ndarray  # Rendered radiance
+    exposure_time: float  # Seconds of the photo
+    gain: float  # Of its response, see display_gain
+    truth: np.ndarray | None = None  # HDR truth in the scale of `hdr`, if the scene has it
+    confidence: np.ndarray | None = None  # [H, W] in [0, 1] of the render, if it was measured
+    new: np.ndarray | None = None  # Rendered half-way to the nearest other view, if there is one
+    alpha: np.ndarray | None = None  # [H, W] coverage of `hdr`
+    new_alpha: np.ndarray | None = None  # [H, W] coverage of `new`
 
     @property
     def scale(self) -> float:

@@ -19,28 +19,18 @@ _NUMBERS = ("minimum", "maximum", "gamma", "base_offset", "alternate_offset")
 class GainMapParameters:
     """Meaning of the pixels of a gain map. Numbers are given for one or three channels, and kept as [3] float64.
 
-    Attributes:
-        minimum: log2 of the gain that 0 stands for.
-        maximum: log2 of the gain that 1 stands for.
-        gamma: exponent of the encoding.
-        base_offset: added to the photo's light before it is multiplied.
-        alternate_offset: subtracted afterwards.
-        base_is_hdr: the photo itself is the HDR rendition, and gains lead to a darker one.
-        in_alternate_colors: gains apply in the primaries of the alternate rendition.
-        is_apple: the map is encoded by Rec.709's curve, and linear in gain; `maximum` is its headroom.
-
     Raises:
         ValueError: for numbers that cannot be, unless base_is_hdr.
     """
 
-    minimum: Any = 0.0
-    maximum: Any = 1.0
-    gamma: Any = 1.0
-    base_offset: Any = 1 / 64
-    alternate_offset: Any = 1 / 64
-    base_is_hdr: bool = False
-    in_alternate_colors: bool = False
-    is_apple: bool = False
+    minimum: Any = 0.0  # log2 of the gain that 0 stands for
+    maximum: Any = 1.0  # log2 of the gain that 1 stands for
+    gamma: Any = 1.0  # Exponent of the encoding
+    base_offset: Any = 1 / 64  # Added to the photo's light before it is multiplied
+    alternate_offset: Any = 1 / 64  # Subtracted afterwards
+    base_is_hdr: bool = False  # The photo itself is the HDR rendition, and gains lead to a darker one
+    in_alternate_colors: bool = False  # Gains apply in the primaries of the alternate rendition
+    is_apple: bool = False  # The map is encoded by Rec.709's curve, and linear in gain; `maximum` is its headroom
 
     def __post_init__(self):
         """Make all numbers [3], and check them."""
