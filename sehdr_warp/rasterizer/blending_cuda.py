@@ -40,19 +40,14 @@ def blend_on_cuda(
 
 @dataclass(frozen=True)
 class BlockBackward:
-    """The backward pass of blend_on_cuda(); see blending.py.
+    """The backward pass of blend_on_cuda(); see blending.py."""
 
-    features: [N, C] or, padded, [N, more]. ellipses: the first two of PackedSplats, all of it that is still read.
-    transmittance: [H, W], the result. last_contributor: [H W] int32, 1 + the index of a pixel's last Gaussian in its
-    tile's list, or 0.
-    """
-
-    features: Tensor
+    features: Tensor  # [N, C] or, padded, [N, more]
     channels: int
     lists: TileLists
-    ellipses: tuple[Tensor, Tensor]
-    transmittance: Tensor
-    last_contributor: Tensor
+    ellipses: tuple[Tensor, Tensor]  # The first two of PackedSplats, all of it that is still read
+    transmittance: Tensor  # [H, W], the result
+    last_contributor: Tensor  # [H W] int32, 1 + the index of a pixel's last Gaussian in its tile's list, or 0
     alpha_threshold: float
     deterministic: bool
 

@@ -64,16 +64,13 @@ _MOST_STOPS = 2.5 * MAX_STOPS  # A misfit and a deviation, each at most MAX_STOP
 
 @dataclass(frozen=True)
 class CameraEntry:
-    """A view of the scene that a run was trained on. exposure_time: seconds; split: "train" or "test".
-
-    placed: its photo, if structure from motion found the camera.
-    """
+    """A view of the scene that a run was trained on."""
 
     name: str
-    split: str
+    split: str  # "train" or "test"
     camera: Camera
-    exposure_time: float
-    placed: PlacedPhoto | None = None
+    exposure_time: float  # Seconds
+    placed: PlacedPhoto | None = None  # Its photo, if structure from motion found the camera
 
 
 class RunFolder:
