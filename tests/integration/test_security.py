@@ -71,8 +71,7 @@ A save ends when its client leaves: a_save_ends_when_its_client_leaves a_save_th
 Blocks exchange them: jobs_exchange_values_in_a_new_folder more_plans_of_blocks
 """
 """Beginnings of sentences, and the tests that hold them, without test_."""
-TRUSTED = ("The user who types", "TOML presets", "The installed packages")
-"""What is trusted is not tested."""
+TRUSTED = ("The user who types", "TOML presets", "The installed packages")  # What is trusted is not tested
 
 
 def sentences() -> list[str]:
@@ -92,8 +91,7 @@ def test_every_sentence_is_held():
 
 
 MODULES = {"pickle", "marshal", "shelve", "dill", "joblib"}
-UNPICKLES = {"training/ranks.py", "scene/photo_storage.py"}
-"""What the processes of one training hand each other."""
+UNPICKLES = {"training/ranks.py", "scene/photo_storage.py"}  # What the processes of one training hand each other
 
 
 def test_no_code_unpickles_or_evaluates():

@@ -24,8 +24,7 @@ def scale_kernel(
     scaled[i] = gain[0] * values[i]
 
 
-ALIVE: list[weakref.ref] = []
-"""The programs that have run."""
+ALIVE: list[weakref.ref] = []  # The programs that have run
 
 
 @differentiable

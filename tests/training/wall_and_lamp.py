@@ -6,8 +6,7 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of
 from sehdr_warp.scene.camera import look_at
 
-WALL, LAMP, SIZE, HALF = 4.0, 2.5, 64, 0.08
-"""Depths of wall and lamp, photos' sides in pixels, half the lamp's side."""
+WALL, LAMP, SIZE, HALF = 4.0, 2.5, 64, 0.08  # Depths of wall and lamp, photos' sides in pixels, half the lamp's side
 
 
 def photographed(light_at, times=(1.0,), response="linear", turn=0.0) -> Scene:

@@ -46,8 +46,7 @@ COMMANDS = {name: line.split() for name, line in COMMANDS.items()}
 TRAIN = COMMANDS.pop("train")
 LOCAL = ("127.0.0.1", "::1", "localhost")
 STARTED = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn")
-LATEST = 300.0
-"""Seconds after which a command hangs, on however busy a machine; of its processor's time it may take 30."""
+LATEST = 300.0  # Seconds after which a command hangs, on however busy a machine; of its processor's time it may take 30
 CHANGES = ("rename", "replace", "unlink", "rmdir", "mkdir", "fsync", "open", "write")
 """Functions of os at which a child may be killed."""
 

@@ -22,8 +22,7 @@ from tests.make_scenes import pattern, png_of
 from .harness import call, files_in
 
 MARKUP = '"><script>PWNED</script><img src=x onerror=PWNED>'
-MOST_MEMORY = 2500
-"""MiB of any command here; the largest picture that is sent has a few thousand pixels."""
+MOST_MEMORY = 2500  # MiB of any command here; the largest picture that is sent has a few thousand pixels
 SHORT = "train photos --out new --preset demo --response srgb --iterations 2 --device cpu -q"
 
 

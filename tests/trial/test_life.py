@@ -18,8 +18,7 @@ from sehdr_warp.viewer.viewer_scene import ViewerScene
 from .harness import COMMANDS, TRAIN
 
 pytestmark = pytest.mark.trial
-FRAMES, FRAMES_EACH = 5 * 3600, 90
-"""An hour at five frames a second, of clients that come, look for so many, and go."""
+FRAMES, FRAMES_EACH = 5 * 3600, 90  # An hour at five frames a second, of clients that come, look for so many, and go
 
 
 @pytest.fixture
