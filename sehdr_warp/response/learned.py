@@ -38,11 +38,7 @@ class ToneMapper(nn.Module, Response, kind="mlp"):
     black, peak, clip_exposure = 0.0, 1.0, math.inf
 
     def __init__(self, width: int = 128, seed: int = 0):
-        """Initialize the weights, so that all channels rise.
-
-        Raises:
-            SehdrError: if the width is not a number from 1.
-        """
+        """Initialize the weights, so that all channels rise; raise SehdrError if the width is not a number from 1."""
         super().__init__()
         if not isinstance(width, int) or isinstance(width, bool) or width < 1:
             raise SehdrError(f"tone mapper: width = {width!r} is not a number from 1")

@@ -139,11 +139,7 @@ class Undistortion:
     """
 
     def __init__(self, lens: Lens):
-        """Compute the map.
-
-        Raises:
-            InputError: if the distortion cannot be inverted.
-        """
+        """Compute the map; raise InputError if the distortion cannot be inverted."""
         with preserve_signals():
             import pycolmap
 

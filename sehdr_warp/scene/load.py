@@ -306,11 +306,7 @@ def embedded_scenes() -> tuple[str, ...]:
 
 
 def embedded_folder(path: str) -> Path:
-    """Return the folder of `embedded` or `embedded:NAME`.
-
-    Raises:
-        InputError: if it is not here.
-    """
+    """Return the folder of `embedded` or `embedded:NAME`; raise InputError if it is not here."""
     name, folders = str(path).partition(":")[2] or "room", _embedded_folders()
     if name in folders:
         return folders[name]

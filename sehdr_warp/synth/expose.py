@@ -89,11 +89,7 @@ def expose(
 
 
 def exposure_ladder(scene: Scene, response: Response, count: int = 5, factor: float = 4.0) -> tuple[float, ...]:
-    """Return ladder_of() the truth of the training views.
-
-    Raises:
-        InputError: if a view has no truth.
-    """
+    """Return ladder_of() the truth of the training views; raise InputError if a view has no truth."""
     truth = [_truth(scene, view) for view in scene.train_views]
     return ladder_of(scene.name, truth, response.encode, count, factor)
 

@@ -43,11 +43,7 @@ class Light(NamedTuple):
 
 
 def hdr_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) from the header alone.
-
-    Raises:
-        InputError: if it cannot be read or states too many pixels.
-    """
+    """Return (width, height) from the header alone; raise InputError if it cannot be read or states too many pixels."""
     if path.suffix.lower() != ".hdr":
         return _exr_window(path)[1]
     require_file(path)

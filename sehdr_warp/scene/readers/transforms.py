@@ -156,11 +156,7 @@ def _is_set(value: Any) -> bool:
 
 
 def frames_of(values: dict, path: Path) -> list[tuple[str, dict]]:
-    """Return (file_path, frame) of each frame.
-
-    Raises:
-        InputError: if there are no frames or one has no file_path.
-    """
+    """Return (file_path, frame) of each frame; raise InputError if there are no frames or one has no file_path."""
     frames = values.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(path, "has no frames", _REMEDY)
