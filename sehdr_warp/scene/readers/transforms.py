@@ -94,7 +94,7 @@ class _Frames:
     def add_file(self, folder: Path, path: Path, values: dict, split: str | None) -> None:
         """Add the frames of a file; `split` is that of all of them, None if the file states it by frame."""
         frames = frames_of(values, path)
-        splits = _named_splits(values, frames)
+        splits = {} if split else _named_splits(values, frames) or _splits_beside(path, frames)
         images = _frame_images(folder, [name for name, _ in frames], path)
         self.photos |= images
         for name, frame in frames:
@@ -174,6 +174,22 @@ def _named_splits(values: dict, frames: list[tuple[str, dict]]) -> dict[str, str
         filenames = values.get(f"{split}_filenames")
         if isinstance(filenames, list):
             by_name.update({plain_path(name): split for name in filenames if isinstance(name, str)})
+    return _train_and_test(by_name)
+
+
+def _splits_beside(path: Path, frames: list[tuple[str, dict]]) -> dict[str, str]:
+    """Return splits by plain_path() file_path: of <file>_<split>.json beside a file, if they list all its frames."""
+    by_name: dict[str, str] = {}
+    for split in ("test", "val", "train"):  # What several list is trained on.
+        other = path.with_name(f"{path.stem}_{split}.json")
+        with suppress(InputError):  # Files that cannot be read list nothing.
+            names = frames_of(read_json(other), other) if other.is_file() else []
+            by_name |= {plain_path(name): split for name, _ in names}
+    return _train_and_test(by_name) if all(plain_path(name) in by_name for name, _ in frames) else {}
+
+
+def _train_and_test(by_name: dict[str, str]) -> dict[str, str]:
+    """Return the splits train and test of names; val stands for test if there is none."""
     splits = {"train": "train", "test" if "test" in by_name.values() else "val": "test"}
     return {name: splits[split] for name, split in by_name.items() if split in splits}
 

@@ -194,6 +194,21 @@ def test_names_of_web_addresses(tmp_path):
     assert read_transforms(tmp_path).records[0].image.name == "r 0.png"
 
 
+def test_split_files_beside_transforms_json_divide_its_frames(tmp_path):
+    write_blender(tmp_path, 9)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    frames, train, test = values["frames"], tmp_path / "transforms_train.json", tmp_path / "transforms_test.json"
+    train.write_text(json.dumps(values | {"frames": frames[:6]}))
+    test.write_text(json.dumps(values | {"frames": frames[5:]}))
+    assert [view.name for view in load(tmp_path).test_views] == ["r_6", "r_7", "r_8"]
+    for other in (json.dumps(values | {"frames": frames[7:]}), "{}"):  # Files of another set, or damaged
+        test.write_text(other)
+        assert [view.name for view in load(tmp_path).test_views] == ["r_4"]
+    test.write_text(json.dumps(values))
+    (tmp_path / "transforms.json").unlink()
+    assert [view.name for view in load(test).test_views] == ["r_4"], "a file that is given itself has all its frames"
+
+
 @pytest.mark.parametrize("new", [0, 2])
 @pytest.mark.parametrize("place", ["images", "test"])
 def test_photos_that_are_trained_on_are_not_held_out(tmp_path, place, new):
