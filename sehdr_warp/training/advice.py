@@ -140,8 +140,10 @@ def advice(
         if gain < UNFINISHED and not few_placed and (best := max(point.psnr for point in points)) < FAILED:
             remedy = "photos from places between them would help most"
             remedy += f"; or find their cameras anew {anew}" if posed else f": {again}"
-            likely = "photos overlap too little, or their cameras are wrong"
-            return [f"held-out photos are at {best:.1f} dB, so the scene as a whole does not fit: {likely}; {remedy}"]
+            likely = "photos overlap too little, show different light, or their cameras are wrong"
+            return [
+                f"held-out photos reach {best:.1f} dB at best, so the scene as a whole does not fit: {likely}; {remedy}"
+            ]
         if gain > STILL_RISING:
             command = f"sehdr-warp train --resume --out {run} --iterations {2 * iterations}"
             lines.append(
