@@ -16,8 +16,13 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, write_gaussians
 from sehdr_warp.splats.arrays import HARMONIC_0
 
-from .ply_names import DEGREE_0_NAMES
 from .test_splat_files import gaussians, rewrite
+
+DEGREE_0_NAMES = [
+    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+]
+"""Names of the properties of Gaussians without higher harmonics, in the order of the reference release."""
 
 
 def write_ply(path, comments=(), **more):
