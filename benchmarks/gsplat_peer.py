@@ -10,8 +10,7 @@ from sehdr_warp.kernels.constants import EPS2D
 from .splats import SplatScene
 
 GSPLAT = "gsplat"
-BOUND = 1e-3
-"""Largest relative difference of its image from ours."""
+BOUND = 1e-3  # Largest relative difference of its image from ours
 
 
 def note_missing(result: dict, device: torch.device) -> bool:

@@ -19,8 +19,7 @@ from sehdr_warp.scene import Camera
 from sehdr_warp.scene.images.hdr_files import read_exr_channels
 
 FOLDER = "light"
-LIGHT = "light.npz"
-"""File of a job's folder."""
+LIGHT = "light.npz"  # File of a job's folder
 NORMALS = 200  # Directions that surfaces face, evenly over the sphere
 LEAST_SEEN = 0.1  # A surface counts if photos show this part of its hemisphere, weighted by the cosine
 FINER, FINEST = 4, 32
@@ -30,17 +29,11 @@ larger ones small Gaussians no longer hide each other, and a small lamp of sever
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """The true light of a place.
+    """The true light of a place."""
 
-    Attributes:
-        position: [3] in the scene.
-        radiance: [H, 2 H, 3], lat-long in the scene's axes (see output.environment_map).
-        coverage: [H, 2 H] in [0, 1], the part of a pixel that photos show.
-    """
-
-    position: np.ndarray
-    radiance: np.ndarray
-    coverage: np.ndarray
+    position: np.ndarray  # [3] in the scene
+    radiance: np.ndarray  # [H, 2 H, 3], lat-long in the scene's axes (see output.environment_map)
+    coverage: np.ndarray  # [H, 2 H] in [0, 1], the part of a pixel that photos show
 
 
 def read_light_maps(folder: Path) -> list[LightMap]:

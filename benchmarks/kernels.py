@@ -26,8 +26,7 @@ PLAIN_TORCH_BYTES = 4 << 30
 IMAGE_BOUND, GRADIENT_BOUND = 1e-4, 1e-3
 """Largest relative difference, in norm, of float32 from float64. Alphas that fall on the other side of the threshold
 make most of it; a wrong formula or a lost Gaussian is far beyond."""
-PASSES = {"forward": False, "forward + backward": True}
-"""List whether a timed pass includes the backward pass."""
+PASSES = {"forward": False, "forward + backward": True}  # List whether a timed pass includes the backward pass
 REFERENCE_GAUSSIANS = 4000
 """Scenes of at most so many Gaussians are checked themselves, larger ones on a smaller one of the same density."""
 

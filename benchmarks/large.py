@@ -32,10 +32,8 @@ from .timing import forget_peaks, held_memory
 
 LOG = logging.getLogger("large")
 RESPONSE = "srgb"
-WARM_UP = 5
-"""The first 1 / WARM_UP of a training is not timed, because kernels load and photos are matched."""
-HELD_OUT = 8
-"""One of HELD_OUT photos is held out."""
+WARM_UP = 5  # The first 1 / WARM_UP of a training is not timed, because kernels load and photos are matched
+HELD_OUT = 8  # One of HELD_OUT photos is held out
 
 
 def main(sizes: tuple[str, ...], /, json: Path, photos: int = 24, iterations: int = 1000) -> None:

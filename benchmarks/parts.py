@@ -14,12 +14,9 @@ from sehdr_warp.quiet import silent_stderr
 from .timing import Variant
 from .workload import count_blended_pairs
 
-STEPS = 20
-"""Number of profiled steps."""
-COPIED = 1 << 28
-"""Bytes of the copy that measures the bandwidth of the memory."""
-CYCLES = 20_000_000
-"""Cycles that a kernel idles to measure the clock."""
+STEPS = 20  # Number of profiled steps
+COPIED = 1 << 28  # Bytes of the copy that measures the bandwidth of the memory
+CYCLES = 20_000_000  # Cycles that a kernel idles to measure the clock
 SCHEDULERS = 4  # In a multiprocessor; each issues one instruction of a warp in a cycle
 OTHER = "torch's own"
 
@@ -48,23 +45,14 @@ KERNELS = {
 
 @dataclass(frozen=True)
 class Work:
-    """The amount of work of a step.
+    """The amount of work of a step."""
 
-    Attributes:
-        gaussians: Gaussians.
-        harmonics: numbers of a Gaussian's harmonics.
-        channels: features that are blended.
-        pairs: pairs of a Gaussian and a tile.
-        warp_pairs: pairs of a Gaussian and a warp that blends it.
-        pixels: of the image.
-    """
-
-    gaussians: int
-    harmonics: int
-    channels: int
-    pairs: int
-    warp_pairs: int
-    pixels: int
+    gaussians: int  # Gaussians
+    harmonics: int  # Numbers of a Gaussian's harmonics
+    channels: int  # Features that are blended
+    pairs: int  # Pairs of a Gaussian and a tile
+    warp_pairs: int  # Pairs of a Gaussian and a warp that blends it
+    pixels: int  # Of the image
 
 
 FLOAT = 4

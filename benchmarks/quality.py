@@ -38,12 +38,10 @@ from .timing import Variant, forget_peaks, time_variants
 LOG = logging.getLogger(__name__)
 FORMAT = 8  # Version of jobs and results; jobs of other versions run again.
 RESULT, FAILURE = "result.json", "failure.json"
-EXPOSURES, FACTOR = 5, 4.0
-"""Exposures of a scene, each FACTOR times longer than the last, around a well exposed one."""
+EXPOSURES, FACTOR = 5, 4.0  # Exposures of a scene, each FACTOR times longer than the last, around a well exposed one
 KNOWN, BLIND, LEARNED = "known", "blind", "learned"
 """A method gets the curve, chooses one, or learns it; if it learns it, known and blind are one training."""
-UPPER_BOUND = "truth"
-"""3DGS trained on the HDR truth, which every method is compared with."""
+UPPER_BOUND = "truth"  # 3DGS trained on the HDR truth, which every method is compared with
 METHOD_FIELDS = (
     "response.name",
     *("fusion.enabled", "loss.form", "loss.ldr_weight", "loss.hdr_weight", "loss.linear_weight"),

@@ -33,8 +33,7 @@ LOG = logging.getLogger("relight")
 SIZE, SAMPLES, DEPTH = 96, 256, 3  # Pixels of a ball, paths of a pixel, and surfaces of a path
 FINER = 8  # Rows of Mitsuba's map for each of ours
 RADIUS, DISTANCE = 0.05, 0.6  # Meters: of a ball, and from the balls to the camera
-SHOWN = ("lamps", "night", "window"), (1, 2, 3)
-"""Rooms and exposures that are compared."""
+SHOWN = ("lamps", "night", "window"), (1, 2, 3)  # Rooms and exposures that are compared
 METHODS = "default", "3dgs", "paper", "truth"
 PICTURED = ("default", "map"), ("default", "lights"), ("3dgs", "map"), ("paper", "map")
 

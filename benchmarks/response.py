@@ -20,10 +20,8 @@ from .results import new_result
 
 LOG = logging.getLogger(__name__)
 CODES = np.arange(10, 246)
-FIXED = ("srgb", "camera")
-"""Curves that are also taken always, without a look at the photos."""
-GOOD = 0.35
-"""Stops: a chosen curve within them counts as good."""
+FIXED = ("srgb", "camera")  # Curves that are also taken always, without a look at the photos
+GOOD = 0.35  # Stops: a chosen curve within them counts as good
 
 
 def response_error(response: Response, truth: Response) -> float:

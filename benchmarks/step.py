@@ -25,14 +25,12 @@ from .splats import Size, make_photo_scene
 from .timing import Variant, forget_peaks, held_memory, peak_memory, summary, time_variants, wait
 
 LOG = logging.getLogger(__name__)
-LAUNCHED = "sehdr-warp, launched"
-"""The same step without a CUDA graph: each kernel launched from Python."""
+LAUNCHED = "sehdr-warp, launched"  # The same step without a CUDA graph: each kernel launched from Python
 CHECKED_STEPS = 4
 FIRST_LOSS_BOUND, LATER_LOSS_BOUND = 1e-4, 1e-2
 """Largest relative difference of the loss at the first step (a forward pass) and at the last checked one, which has
 the gradients and the optimizer in it; Adam's division makes much of what float32 rounds."""
-INTERVALS = {"cuda": 3, "cpu": 1}
-"""Densification intervals over which the mean step is taken."""
+INTERVALS = {"cuda": 3, "cpu": 1}  # Densification intervals over which the mean step is taken
 
 
 def bench_step(size: Size, device: torch.device, *, presets: Sequence[str], repetitions: int, views: int = 18) -> dict:

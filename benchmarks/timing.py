@@ -17,10 +17,8 @@ from sehdr_warp.quiet import silent_stderr
 from sehdr_warp.rasterizer.memory import warp_memory_bytes
 
 LEAST_REPETITIONS = 3
-BUDGET = 10.0
-"""Seconds that one variant may take on the CPU; a slow one runs less often."""
-TURNS = 3
-"""Number of turns into which the repetitions of each variant are divided."""
+BUDGET = 10.0  # Seconds that one variant may take on the CPU; a slow one runs less often
+TURNS = 3  # Number of turns into which the repetitions of each variant are divided
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,9 @@ from .timing import time_variants, wait
 
 LOG = logging.getLogger(__name__)
 PRESET, PHOTOS = "default", 8
-WARM_UP = 20
-"""Steps on GPUs before the timed ones: launched, captured, and some replayed."""
-STEPS = 10
-"""Steps on GPUs for each repetition, one after the other without a pause, as in a training."""
-BOUND = 1e-12
-"""Largest difference of losses between numbers of threads: less than float32 resolves."""
+WARM_UP = 20  # Steps on GPUs before the timed ones: launched, captured, and some replayed
+STEPS = 10  # Steps on GPUs for each repetition, one after the other without a pause, as in a training
+BOUND = 1e-12  # Largest difference of losses between numbers of threads: less than float32 resolves
 
 
 def bench_workers(sizes: Sequence[Size], device: torch.device, *, repetitions: int) -> dict:

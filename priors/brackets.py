@@ -35,19 +35,12 @@ MOST_UNKNOWN = 0.1  # Share of a photo's clipped values that no darker photo may
 
 @dataclass(frozen=True)
 class Exposure:
-    """One photo of a stack at the size that the network sees, [h, w, 3] each.
+    """One photo of a stack at the size that the network sees, [h, w, 3] each."""
 
-    Attributes:
-        seconds: its exposure time.
-        exposure: mean decoded values, in multiples of white.
-        clipped: share of a pixel's area that clips.
-        black: share of a pixel's area that is nearly black.
-    """
-
-    seconds: float
-    exposure: np.ndarray
-    clipped: np.ndarray
-    black: np.ndarray
+    seconds: float  # Its exposure time
+    exposure: np.ndarray  # Mean decoded values, in multiples of white
+    clipped: np.ndarray  # Share of a pixel's area that clips
+    black: np.ndarray  # Share of a pixel's area that is nearly black
 
 
 def read_exposures(folder: Path) -> list[Exposure]:

@@ -14,8 +14,7 @@ from sehdr_warp.scene import Camera, look_at
 from .stage import Stage
 
 COLUMNS, ROWS = 7, 5
-VIEWS = COLUMNS * ROWS
-"""HDR-NeRF's number of views; the even ones train (18), the odd ones test (17)."""
+VIEWS = COLUMNS * ROWS  # HDR-NeRF's number of views; the even ones train (18), the odd ones test (17)
 Place = tuple[float, float, float]
 
 
