@@ -101,7 +101,8 @@ def _from_file(
         return views
     # Frames of a moving camera are named as by read_exchange_cameras(): numbers of four characters or more.
     frames, names = re.compile(re.escape(only) + r"_[-\d.]{4,}"), [name for name, _ in views]
-    matches = [view for view in views if view[0] == only] or [view for view in views if frames.fullmatch(view[0])]
+    same = [(name, each) for name, each in views if name == only]
+    matches = same or [(name, each) for name, each in views if frames.fullmatch(name)]
     if not matches:
         raise SehdrError(f"{path}: has no camera {only!r}{did_you_mean(only, names)}")
     return matches
