@@ -170,7 +170,13 @@ def parse_dataset(
     check_response(dataset, response, path)
     unplaced: list[str] = []
     if records and records[0].lens is UNPLACED:
-        dataset, unplaced = with_cameras(dataset, cameras) if cameras else place_photos(dataset, cache)
+        try:
+            dataset, unplaced = with_cameras(dataset, cameras) if cameras else place_photos(dataset, cache)
+        except InputError as error:
+            if dataset.format != "video":
+                raise
+            remedy = "film slowly and in bright light, while you move past things that stand still"
+            raise InputError(root, error.problem.replace("photos", "frames"), remedy) from None  # Not frames in a cache
         records = list(dataset.records)
         if unplaced:  # Their times are not to be told of, nor the others' relative to theirs.
             untimed = [replace(record, exposure_time=None, time_known=True) for record in records]

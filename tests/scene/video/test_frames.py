@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color.encoding import encoding_of
@@ -103,6 +104,16 @@ def test_a_clip_within_rec709_is_converted_and_another_keeps_its_primaries(tmp_p
         assert (decoded.min() < -0.1) is np.bool_(saturated)
     by_another = load_scene(tmp_path / "a.mov", cache=tmp_path / "cache", max_size=64, response="camera")
     assert by_another.color_matrix is not None and not by_another.light_known
+
+
+def test_a_clip_whose_cameras_are_not_found_is_named_itself(tmp_path, monkeypatch):
+    def place(dataset, _):
+        raise InputError(dataset.folder, "none of the 24 photos could be placed", "bring poses")
+
+    monkeypatch.setattr("sehdr_warp.scene.load.place_photos", place)
+    write_clip(tmp_path / "a.mov", list(pan(30)))
+    with pytest.raises(InputError, match=r"a\.mov: none of the 24 frames could be placed; film slowly"):
+        load_scene(tmp_path / "a.mov", cache=tmp_path / "cache")
 
 
 def test_clipped_channels_stay_clipped_in_rec709():
