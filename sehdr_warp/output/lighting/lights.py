@@ -330,5 +330,6 @@ def _shows_lights(
     for index in members:
         part[index] = 1
     options = {"focal_length": focal, "pixel_angle": 2 * np.pi / size, "beyond": center.beyond, "shares": part}
-    rendered = run.render_directions(center.position, latlong(size) @ to_scene, **options)
-    return np.kron(rendered.clipped.cpu().numpy() > 0.5, np.ones((8, 8), bool))
+    clipped = run.render_directions(center.position, latlong(size) @ to_scene, **options).clipped
+    assert clipped is not None  # It is what `shares` is rendered to.
+    return np.kron(clipped.cpu().numpy() > 0.5, np.ones((8, 8), bool))
