@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -39,6 +39,10 @@ _NO_AGREEMENT = (
 DEPTH_RANGE = (0.5, 3.0)
 """Depths of random points in units of the cameras' focus. Nearer ones remain as floaters before the cameras: on the
 embedded room, 0.15 in place of 0.5 costs 14 dB."""
+LEAST_DISTANCE = 1e-6  # From a camera that a size is derived from, normalized units: a point may lie in a camera
+MAX_START_ANGLE = 0.2
+"""Largest standard deviation of a Gaussian at the start, as a multiple of its distance from the nearest camera. Points
+that are far from all others, such as those of a background, would else start as veils before cameras of new views."""
 
 
 def base_time(scene: Scene) -> float:
@@ -101,7 +105,19 @@ def make_field(
     dc = make_color_model(config.model.radiance).start(colors, response)
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
     gaussians = Gaussians.from_points(points, dc, config.model.sh_degree)
+    _limit_sizes(gaussians, normalized.views)
     return assemble_field(gaussians, config, response, time, normalization).to(device)
+
+
+@torch.no_grad()
+def _limit_sizes(gaussians: Gaussians, views: Sequence[View]) -> None:
+    """Shrink Gaussians to MAX_START_ANGLE times their distance from the nearest camera of the views."""
+    from scipy.spatial import KDTree
+
+    cameras = KDTree(np.stack([view.camera.position for view in views]))
+    distances = torch.from_numpy(cameras.query(gaussians.means.double().numpy())[0])
+    largest = (MAX_START_ANGLE * distances.clamp_min(LEAST_DISTANCE)).log().float()
+    gaussians.log_scales.clamp_(max=largest[:, None])
 
 
 def start_gaussians(

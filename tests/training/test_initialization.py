@@ -23,6 +23,7 @@ from sehdr_warp.scene.normalization import normalization_of
 from sehdr_warp.splats import write_gaussians
 from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.initialization import (
+    MAX_START_ANGLE,
     base_time,
     colors_in_views,
     focus_distance,
@@ -46,6 +47,18 @@ def test_focus_of_an_orbit_and_of_cameras_at_one_place(scene):
     assert focus_distance(scene.train_views) == pytest.approx(RADIUS, rel=1e-3)
     still = tuple(dataclasses.replace(view, camera=scene.views[0].camera) for view in scene.views)
     assert focus_distance(still) > 0
+
+
+def test_a_point_far_from_all_others_starts_as_no_veil_before_cameras(scene):
+    points, config = np.r_[scene.points, [[0.0, 0.0, 60.0]]], load_config("default", {"model.initial_density": 0.0})
+    scene = dataclasses.replace(scene, points=points, point_colors=np.full_like(points, 0.5, np.float32))
+    gaussians = make_field(scene, config, LINEAR, "cpu").gaussians
+    views = normalization_of(scene).scene(scene).train_views
+    cameras = torch.tensor(np.stack([view.camera.position for view in views]))
+    angles = gaussians.log_scales.exp()[:, 0].detach() / torch.cdist(gaussians.means.double(), cameras).amin(1)
+    # The others are about as far away from it as the cameras are.
+    assert angles[-1].item() == pytest.approx(MAX_START_ANGLE, rel=1e-4)
+    assert angles.amax() < 1.0001 * MAX_START_ANGLE and angles.amin() < 0.8 * MAX_START_ANGLE
 
 
 @pytest.mark.parametrize("radiance, degree", [("log", 1), ("linear", 3), ("display", 1)])
