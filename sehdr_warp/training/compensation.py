@@ -155,7 +155,9 @@ def estimate_compensation(
     matcher = matcher_of(compensation.parts(**components._asdict()).normalize_photos(small, response))
     matched = match(matcher)
     compensation = fit(matched).parts(**components._asdict())
-    note = _changed_light(compensation, views) * times_known + _reach_note(views, matched, response)
+    note = _reach_note(views, matched, response)
+    if times_known:
+        note = _changed_light(compensation, views) + note
     decision = _decision(compensation, components, times_known, note)
     return CompensationEstimate(compensation, decision, None)
 
