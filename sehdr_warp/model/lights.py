@@ -153,12 +153,10 @@ def find_lights(
         radiance = fit_solid_angles(shape, light_photos.light, places)
         if radiance.mean() * shape.solid_angle(middle) < LEAST_SHARE * total:
             continue
-        of_clipped = group.weights * np.maximum(group.clipped, 1e-6)
-        deviation = None if group.stops is None else float(np.average(_deviations(group), weights=of_clipped))
-        measured = deviation and float(np.average(_deviations(group) * group.measured, weights=of_clipped)) / deviation
+        deviation, measured = _deviation_of_light(group)
         share = float(reaches_middle[group.index].sum()) / total
         bound = np.minimum(_certain_radiance(group, photos), radiance)
-        lights.append(Light(shape, radiance, bound, deviation, share, group.index, measured or 0.0))
+        lights.append(Light(shape, radiance, bound, deviation, share, group.index, measured))
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]
 
 
@@ -303,12 +301,18 @@ def _whole_photos(cameras: Sequence[Camera], group: _Candidates, core: _Candidat
     return _LightPhotos(photos, core.angles.sum(1)[photos], group.light.sum(1)[photos])
 
 
-def _deviations(group: _Candidates) -> np.ndarray:
-    """Return the deviations [K] of log2 radiance, stops, of what clips of a light."""
+def _deviation_of_light(group: _Candidates) -> tuple[float | None, float]:
+    """Return the mean deviation of a light and the share of it that is measured, as Light has them."""
+    if group.stops is None:
+        return None, 0.0
     stops = group.stops / np.maximum(group.clipped, 1e-6)
     # The scene may contradict the photos that measure it.
     misfit = np.maximum(group.doubt - group.stops, 0) / np.maximum(1 - group.clipped, 1e-6)
-    return np.where(group.measured, np.minimum(stops, np.maximum(misfit, MEASURED_STOPS)), stops)
+    deviations = np.where(group.measured, np.minimum(stops, np.maximum(misfit, MEASURED_STOPS)), stops)
+    weights = group.weights * np.maximum(group.clipped, 1e-6)
+    mean = float(np.average(deviations, weights=weights))
+    measured = float(np.average(deviations * group.measured, weights=weights))
+    return mean, measured / mean if mean else 0.0
 
 
 def _certain_radiance(group: _Candidates, photos: _Photos) -> np.ndarray:
