@@ -28,7 +28,7 @@ from .training.initialization import match_points
 from .training.plan import Plan, make_plan
 from .training.train import create_trainer, train
 from .training.trainer import Trainer
-from .training.training_state import TrainingProgress
+from .training.training_progress import TrainingProgress
 
 __all__ = [
     "Camera",

@@ -181,8 +181,8 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
     from ..runs.run_writer import RunWriter
     from ..viewer.live import serve_training
     from .advice import advice_on, options_of_run
+    from .hdr_truth import check_dataset_truth
     from .process_settings import precompiling
-    from .scene_facts import check_dataset_truth
     from .train import create_trainer
 
     output, out = args.output, args.output.out

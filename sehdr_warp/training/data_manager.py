@@ -28,6 +28,9 @@ from .training_views import TrainingView, ViewDataset, ViewStack
 
 log = logging.getLogger(__name__)
 
+INTERVALS_FROM = 0.85
+"""Fraction of a training after which bright codes are intervals. From the start, clipped light would have fewer pixels
+around it that determine it."""
 SLOTS = 3  # One is read, one is filled, and one may still be read by a step that has not finished
 MAX_MEMORY_PART = 0.4  # Of the device's free memory for photos; stacking them takes as much again for a while
 
@@ -54,9 +57,9 @@ class DataManager:
             return None
         return [estimate.log_light for estimate in self.light_estimates]
 
-    def use_code_intervals(self) -> None:
-        """Turn bright codes into intervals, if they are not yet."""
-        if not self._uses_intervals:
+    def prepare(self, iteration: int) -> None:
+        """Prepare the targets of an iteration: late in a training, bright codes are intervals, see INTERVALS_FROM."""
+        if iteration > INTERVALS_FROM * self._config.schedule.iterations and not self._uses_intervals:
             self._uses_intervals = True
             self._dataset.scale.use_intervals()
 

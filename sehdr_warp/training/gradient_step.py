@@ -23,9 +23,9 @@ from ..response.learned import EXACT_BELOW
 from ..runs.config import Config
 from ..scene import Scene
 from .flat_gradients import FlatGradients
+from .hdr_truth import largest_hdr_truth
 from .losses import compared_image, data_loss, extra_images, opacity_loss
 from .ranks import Ranks
-from .scene_facts import largest_hdr_truth
 from .strategies import SEED_STRIDE, Strategy
 from .training_views import TrainingView
 

@@ -12,9 +12,6 @@ from ..response import Response, ToneMapper
 from ..runs.config import LossConfig
 from .targets import Target, mu_law
 
-INTERVALS_FROM = 0.85
-"""Fraction of a training after which bright codes are intervals. From the start, clipped light would have fewer pixels
-around it that determine it."""
 ANCHOR = 0.5  # Encoded value of the unit exposure that anchor_loss aims at: the middle of the range
 
 

@@ -20,8 +20,9 @@ from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.photos import FEWEST_PHOTOS
 from .cost import cpu_seconds
+from .hdr_truth import largest_hdr_truth
 from .initialization import base_time, start_count
-from .scene_facts import LARGE_SCENE, SceneFacts, largest_hdr_truth, measure_scene
+from .scene_facts import LARGE_SCENE, SceneFacts, measure_scene
 from .strategies import mcmc_cap
 
 STEPS_PER_PHOTO = 75

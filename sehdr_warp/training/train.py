@@ -25,12 +25,12 @@ from ..runs.values import LoadArguments
 from ..scene import Scene
 from ..scene.normalization import Normalization, normalization_of
 from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
+from .hdr_truth import check_scene_truth
 from .initialization import make_field, make_matcher, response_for_training
 from .plan import check_fields, make_plan
 from .process_settings import summary_writer
 from .ranks import Ranks
 from .run_output import RunOutput
-from .scene_facts import check_scene_truth
 from .seeding import brighten_clipped
 from .trainer import Trainer, sizes_of
 from .training_state import load_state, state_of

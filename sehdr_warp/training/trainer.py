@@ -31,7 +31,6 @@ from .advice import best_if_overfitted, evaluations
 from .data_manager import DataManager, PhotoSampler
 from .gradient_step import OVERFLOWED, SKIPPED, GradientStep, StepOptions, StepResult
 from .initialization import make_matcher
-from .losses import INTERVALS_FROM
 from .matching import Matcher
 from .moving_average import MovingAverage
 from .optimizer import make_optimizer, means_rate, set_means_rate
@@ -42,7 +41,7 @@ from .scene_facts import is_large
 from .seeding import make_seeds
 from .step_runner import StepRunner
 from .strategies import SEED_STRIDE, Seeds, make_strategy
-from .training_state import TrainingProgress
+from .training_progress import TrainingProgress
 
 log = logging.getLogger(__name__)
 
@@ -227,8 +226,7 @@ class Trainer:
         # Photo, learning rates and options. The last step may have more photos than iterations are left.
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
-        if self.iteration > INTERVALS_FROM * self.total:
-            self.data_manager.use_code_intervals()
+        self.data_manager.prepare(self.iteration)
         self._view_index = self.sampler.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)

@@ -1,4 +1,4 @@
-"""The state of a training, as a checkpoint stores it and as ranks send it to each other, and its progress."""
+"""The state of a training, as a checkpoint stores it and as ranks send it to each other."""
 
 from __future__ import annotations
 
@@ -54,41 +54,3 @@ def load_state(trainer: Trainer, state: Checkpoint) -> None:
     trainer.seconds = values["seconds"]
     trainer.gradient_step.step_counters[SKIPPED] = values["skipped_steps"]
     trainer.gradient_step.step_counters[OVERFLOWED] = values["overflowed_steps"]
-
-
-class TrainingProgress:
-    """Values of a training after a step.
-
-    `loss`, `psnr` and `gaussians` are read from the device when they are accessed, until the next step.
-
-    Attributes:
-        iteration: Iterations done.
-        total: Iterations in all.
-        seconds: Duration of the training so far.
-        seconds_left: Estimated time to the end; None after the first step.
-    """
-
-    def __init__(self, trainer: Trainer, seconds_left: float | None):
-        """Take the values of a trainer after a step."""
-        self._trainer = trainer
-        self.iteration, self.total, self.seconds = trainer.iteration, trainer.total, trainer.seconds
-        self.seconds_left = seconds_left
-
-    def __repr__(self) -> str:
-        """Return iteration and time; nothing is read from the device."""
-        return f"TrainingProgress({self.iteration} of {self.total}, {self.seconds:.1f} s)"
-
-    @property
-    def loss(self) -> float:
-        """Loss of the step."""
-        return self._trainer.loss
-
-    @property
-    def psnr(self) -> float:
-        """PSNR of the step's photo, dB."""
-        return self._trainer.psnr()
-
-    @property
-    def gaussians(self) -> int:
-        """Number of Gaussians."""
-        return self._trainer.field.gaussians.count

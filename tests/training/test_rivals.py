@@ -14,9 +14,9 @@ from sehdr_warp.rasterizer.losses.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import Config, LossConfig, ResponseConfig
 from sehdr_warp.runs.config_files import load_config, override_config, preset_names
+from sehdr_warp.training.hdr_truth import largest_hdr_truth
 from sehdr_warp.training.initialization import response_for_training
 from sehdr_warp.training.losses import anchor_loss, data_loss, hdr_loss
-from sehdr_warp.training.scene_facts import largest_hdr_truth
 from sehdr_warp.training.targets import Target, code_scale
 from sehdr_warp.training.train import train
 
