@@ -35,7 +35,10 @@ MAX_DB = 100.0  # Score of identical images, so that a mean over views is finite
 
 
 class RunOutput:
-    """Evaluates, logs and saves a training."""
+    """Evaluates and logs a training, and decides when it is saved.
+
+    RunWriter writes the files; load_run() reads them as a Run.
+    """
 
     def __init__(self, folder: RunWriter, config: Config, *, tensorboard: bool = False, is_block: bool = False):
         """Prepare to write a training with a config to its run folder, and event files if `tensorboard`.
@@ -121,17 +124,12 @@ class RunOutput:
             self._writer.close()
         if trainer.iteration < trainer.total:
             return
-        evidence, checkpoint_hash = self._evidence, self.folder.checkpoint_hash
-        if self._is_block and evidence is not None and checkpoint_hash is not None:
-            write_confidence(self.folder, evidence, checkpoint_hash)
-            return
-        run = self.load_run(trainer.device)
-        evidence = evidence or run.measure_confidence(trainer.scene)
-        run.set_evidence(evidence)
-        write_confidence(self.folder, evidence, run.checkpoint_hash)
+        evidence = self._evidence or self.load_run(trainer.device).measure_confidence(trainer.scene)
+        checkpoint_hash = self.folder.checkpoint_hash
+        assert checkpoint_hash is not None, "save_end() writes a checkpoint"
+        write_confidence(self.folder, evidence, checkpoint_hash)
         if not self._is_block:
-            self.folder.write_summary(run.summary() | {"estimated_light": round(estimated_light(run, evidence), 4)})
-            self._report_residuals(run, trainer)
+            self._compare_photos(trainer, evidence)
 
     def _write_summary(self, trainer: Trainer) -> None:
         """Write summary.json: times, memory and counts; one of this iteration stays if no step was taken."""
@@ -146,12 +144,14 @@ class RunOutput:
         }
         self.folder.write_summary(summary | machine_figures(trainer.device))
 
-    def _report_residuals(self, run: Run, trainer: Trainer) -> None:
-        """Compare the training photos with the scene, and list the regions that differ in summary and log."""
-        views = trainer.scene.train_views
-        regions, offsets = compare_photos(run.field, views, degree=run.degree)
+    def _compare_photos(self, trainer: Trainer, evidence: Evidence) -> None:
+        """Add to the summary how much light the photos clip, and where they differ from the scene; log the latter."""
+        run = self.load_run(trainer.device)
+        run.set_evidence(evidence)
+        regions, offsets = compare_photos(run.field, trainer.scene.train_views, degree=run.degree)
+        light = {"estimated_light": round(estimated_light(run, evidence), 4)}
         unexplained = {"unexplained": regions_to_dict(regions), "brightness_offsets": offsets}
-        self.folder.write_summary(run.summary() | unexplained)
+        self.folder.write_summary(run.summary() | light | unexplained)
         if regions:
             worst, photos = regions[0], len({region.photo for region in regions})
             place = f"{worst.photo} at column {worst.column:.0f}, row {worst.row:.0f}, {worst.pixels} pixels"

@@ -43,8 +43,9 @@ class StepRunner:
         device = step.step_counters.device
         self.enabled = enabled and device.type == "cuda"
         self.reserves_rows, self._reserved_rows = self.enabled and not deterministic, 0
-        self._first = CudaGraphRunner(device) if self.enabled else None
-        self._second = CudaGraphRunner(device, self._first.stream) if self._first and step.ranks is not None else None
+        # Of the whole step; on several GPUs of what precedes the average of the gradients, and of the update after it.
+        self._graph = CudaGraphRunner(device) if self.enabled else None
+        self._update_graph = CudaGraphRunner(device, self._graph.stream) if self._graph and step.ranks else None
         self._index = torch.zeros(1, dtype=torch.int64, device=device)
         self._eager_keys: set[GraphKey] = set()
 
@@ -72,11 +73,11 @@ class StepRunner:
 
         Kernels are loaded when they first run, so the first step of a key runs without a graph.
         """
-        return self._first is not None and isinstance(views, ViewStack | PhotoStream) and key in self._eager_keys
+        return self._graph is not None and isinstance(views, ViewStack | PhotoStream) and key in self._eager_keys
 
     def on_capture_stream(self) -> AbstractContextManager[None]:
         """Return a context for other work, which shares stream and memory with captured steps."""
-        return nullcontext() if self._first is None else self._first.on_capture_stream()
+        return nullcontext() if self._graph is None else self._graph.on_capture_stream()
 
     def _replay(
         self,
@@ -89,19 +90,19 @@ class StepRunner:
         iteration: int,
     ) -> StepResult:
         """Replay the graphs of a key; they are captured if there are none."""
-        step, first, second = self._step, self._first, self._second
-        assert first is not None
+        step, graph, update_graph = self._step, self._graph, self._update_graph
+        assert graph is not None
         self._index.fill_(index)
         if isinstance(views, PhotoStream):
             views.bring(index)
         try:
-            if second is None:
-                result = first.run(key, lambda: step.run(views.at(self._index), options, capacity))
+            if update_graph is None:
+                result = graph.run(key, lambda: step.run(views.at(self._index), options, capacity))
             else:
                 with step.reserved_memory():
-                    gradients = first.run(key, lambda: step.compute_gradients(views.at(self._index), options, capacity))
+                    gradients = graph.run(key, lambda: step.compute_gradients(views.at(self._index), options, capacity))
                     step.average_gradients()
-                    loss = second.run(key, lambda: step.apply_gradients(gradients))
+                    loss = update_graph.run(key, lambda: step.apply_gradients(gradients))
                 result = StepResult(loss, gradients.image, gradients.rendering.intersection_count)
         except RuntimeError as error:
             if failed_allocation(error):
@@ -146,7 +147,7 @@ class StepRunner:
 
     def invalidate(self) -> None:
         """Free the graphs, because something that they hold fixed has changed."""
-        for runner in (self._first, self._second):
+        for runner in (self._graph, self._update_graph):
             if runner is not None:
                 runner.invalidate()
 

@@ -9,7 +9,7 @@ from .toy import make_trainer
 
 def captured(trainer: Trainer):
     """The CUDA graph that the next step with the same key replays; None if there is none."""
-    runner = trainer.step_runner._first
+    runner = trainer.step_runner._graph
     return None if runner is None else runner._graph
 
 

@@ -92,7 +92,7 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
 
     config = quick()
     trainer = make_trainer(scene, config)
-    trainer.step_runner._first = BrokenRunner()
+    trainer.step_runner._graph = BrokenRunner()
     monkeypatch.setattr(trainer.step_runner, "can_replay", lambda *_: trainer.iteration > 1)
     trainer.step()
     with pytest.raises(SehdrError, match=r"iteration 2: .*not permitted.*schedule.use_cuda_graph = False"):

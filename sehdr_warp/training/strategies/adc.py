@@ -10,7 +10,7 @@ from ...model.gaussians import PARAMETER_NAMES, Gaussians, Optimizer, rotate
 from ...rasterizer import Rendering
 from ...rasterizer.ops.step_updates import add_gradient_statistics
 from ...runs.config import AdcConfig
-from .base import Strategy
+from .base import Schedule, Strategy
 
 SPLIT_SHRINK = 1.6  # Factor by which the two halves of a split are smaller (3DGS: 0.8 times the number of halves)
 MIN_RESET_INTERVAL = 300
@@ -74,9 +74,8 @@ class AdcStrategy(Strategy):
 
     def _resets(self, iteration: int, step_batch: int) -> bool:
         """Return whether opacities are reset after this step."""
-        past = iteration % self.reset_every
-        before_stop = iteration - past < self.schedule.stop
-        return past < step_batch and before_stop and self.reset_every >= MIN_RESET_INTERVAL
+        resets = Schedule(0, self.schedule.stop, self.reset_every)
+        return self.reset_every >= MIN_RESET_INTERVAL and resets.is_due(iteration, step_batch)
 
     def _select(self, gaussians: Gaussians, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Return masks [N] of the Gaussians to duplicate and of those to split, by their mean gradient [N].
