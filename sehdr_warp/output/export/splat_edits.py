@@ -67,7 +67,7 @@ def read_region(text: str) -> Box | Sphere:
             return Sphere(values[:3], float(values[3]))
         if kind == "box" and values.shape == (6,) and (values[:3] != values[3:]).all():
             return Box(np.minimum(values[:3], values[3:]), np.maximum(values[:3], values[3:]))
-    raise SehdrError(f"region {text!r} is not box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius")
+    raise SehdrError(f"region {text!r:.90} is not box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius")
 
 
 @dataclass(frozen=True)
