@@ -2,7 +2,7 @@
 
 A response and the fusion of brackets act on the light of a direction, and viewers blend encoded colors instead of
 light, so no harmonics represent the scene exactly. They are fitted for each Gaussian separately (bake), then jointly to
-rendered images of the scene (refine).
+pictures of the scene (fit_to_pictures).
 """
 
 import logging
@@ -214,7 +214,7 @@ def bake(gaussians: GaussianArrays, change: Colors, color_model: str, camera_pos
     return gaussians.with_colors(fitted, color_model)
 
 
-def refine(
+def fit_to_pictures(
     gaussians: GaussianArrays, picture: Callable[[Camera], Tensor], cameras: Sequence[Camera], *, steps: int = STEPS
 ) -> GaussianArrays:
     """Fit harmonics and opacities of display-color Gaussians to images by Adam; shapes stay.
@@ -247,7 +247,7 @@ def refine(
 
 
 @torch.no_grad()
-def agreement(
+def psnr_of(
     picture: Callable[[Camera], Tensor], reference: Callable[[Camera], Tensor], cameras: Sequence[Camera]
 ) -> float:
     """Return the PSNR of encoded pictures [H, W, 3] against others, dB, at most 120, over all pixels of the cameras."""

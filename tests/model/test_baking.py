@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from sehdr_warp.model import baking
-from sehdr_warp.model.baking import agreement, bake, field_of, gaussians_of, refine, sphere_directions
+from sehdr_warp.model.baking import bake, field_of, fit_to_pictures, gaussians_of, psnr_of, sphere_directions
 from sehdr_warp.rasterizer import spherical_harmonics
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, look_at
@@ -92,9 +92,9 @@ def test_refinement_brings_display_colors_to_the_pictures(device):
     field, cameras = field_of(start).to(device), [camera(x) for x in (-1, 0, 1)]
     positions = np.stack([each.position for each in cameras])
     baked = gaussians_of(field, "display", positions)
-    refined = refine(baked, field.render_ldr, cameras, steps=60)
+    refined = fit_to_pictures(baked, field.render_ldr, cameras, steps=60)
     renderers = (field_of(each).to(device).render_ldr for each in (baked, refined))
-    before, after = (agreement(each, field.render_ldr, cameras) for each in renderers)
+    before, after = (psnr_of(each, field.render_ldr, cameras) for each in renderers)
     assert after > before + 6
     np.testing.assert_array_equal(refined.means, start.means)
-    assert refine(baked, field.render_ldr, []) is baked
+    assert fit_to_pictures(baked, field.render_ldr, []) is baked

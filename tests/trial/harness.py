@@ -83,7 +83,7 @@ def _spare_time() -> None:
     figures, docstrings = importlib.import_module("matplotlib.figure"), importlib.import_module("tyro._docstrings")
     save, make = figures.Figure.savefig, docstrings._ClassTokenization.make
     figures.Figure.savefig = lambda figure, *given, **options: save(figure, *given, **options | {"dpi": 40})
-    gaussians.refine = partial(gaussians.refine, steps=9)
+    gaussians.fit_to_pictures = partial(gaussians.fit_to_pictures, steps=9)
     docstrings._ClassTokenization.make = staticmethod(cache(make))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...errors import InputError, SehdrError, refuse_paths
 from ...files import atomic_path
-from ...model.baking import agreement, field_of, gaussians_of, refine, with_photo_filters
+from ...model.baking import field_of, fit_to_pictures, gaussians_of, psnr_of, with_photo_filters
 from ...response import response_by_name
 from ...runs.run import on_device
 from ...scene.exposure.times import shutter
@@ -98,34 +98,35 @@ def export(
     if cameras and not any(entry.camera.is_pinhole for entry in run.cameras):
         raise SehdrError(f"{run.path}: has no cameras, or none that is a pinhole, to write; leave --cameras out")
     # Regions of edits are in the coordinates of `axes`, before a file with -Y up is turned over.
-    for_edits = _turned(run, path) if axes is None else world_transform(run, axes, up=up, scale=scale)
-    to_file = file_transform(for_edits, path) if axes == "upright" else for_edits
+    to_axes = _turned(run, path) if axes is None else world_transform(run, axes, up=up, scale=scale)
+    to_file = file_transform(to_axes, path) if axes == "upright" else to_axes
     seconds = run.base_time if exposure_time is None else float(exposure_time)
     # Colors that are converted to Rec.709 are encoded by sRGB, at the exposure that shows middle grey as the photos do.
     display_time = seconds if run.color_matrix is None else seconds * display_gain(run.response)
     hdr_model = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
     means = run.field.gaussians.means.detach().cpu().numpy()
-    edits.check_regions(for_edits.points(run.field.normalization.scene_points(means)))  # Before minutes of fitting
-    whole = _gaussians_in_colors(run, "display" if kind == "ldr" else hdr_model, display_time)
-    whole = with_photo_filters(whole, training_cameras(run))
-    mask = edits.mask(whole.opacities, for_edits.points(whole.means), run)
-    part = _select_rows(run, whole, mask, edits, display_time)
-    written = part if to_file.is_identity else part.transformed(to_file.matrix)
+    edits.check_regions(to_axes.points(run.field.normalization.scene_points(means)))  # Before minutes of fitting
+    # All Gaussians of the scene, then those that edits leave; both in the scene's coordinates.
+    gaussians = _gaussians_in_colors(run, "display" if kind == "ldr" else hdr_model, display_time)
+    gaussians = with_photo_filters(gaussians, training_cameras(run))
+    mask = edits.mask(gaussians.opacities, to_axes.points(gaussians.means), run)
+    edited = _select_rows(run, gaussians, mask, edits, display_time)
+    in_file = edited if to_file.is_identity else edited.transformed(to_file.matrix)
     if run.world_matrix is not None:
-        written = replace(written, world_matrix=photos_to_file(run, to_file))
-    written = written.padded(degree or 0)
-    write_gaussians(path, written, overwrite=overwrite)
+        in_file = replace(in_file, world_matrix=photos_to_file(run, to_file))
+    in_file = in_file.padded(degree or 0)
+    write_gaussians(path, in_file, overwrite=overwrite)
     if cameras:
         _write_cameras(camera_file_of(path), run, to_file, overwrite)
     elif overwrite and not (to_file.is_identity and Path(run.path).resolve() == path.resolve()):
         # Cameras of an earlier export would count as these Gaussians'. Those of a file edited in place still fit it.
         remove_earlier(path.parent, [camera_file_of(path).name])
     meaning = f"display colors of {shutter(seconds)}" if kind == "ldr" else "scene-linear radiance"
-    log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, written.count, written.degree, meaning)
-    compared, note = (whole, ", before the cut") if edits.shows_part else (part, "")
+    log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, in_file.count, in_file.degree, meaning)
+    compared, note = (gaussians, ", before the cut") if edits.shows_part else (edited, "")
     _log_loss(run, compared, kind, display_time, note)
     if path_is_lossy(path):
-        _log_file_loss(path, run, part if edits.shows_part else None, to_file, display_time)
+        _log_file_loss(path, run, edited if edits.shows_part else None, to_file, display_time)
     return path
 
 
@@ -138,13 +139,15 @@ def _turned(run: "RenderableScene", path: Path) -> WorldTransform:
 def _select_rows(
     run: "RenderableScene", gaussians: GaussianArrays, mask: np.ndarray, edits: SplatEdits, display_time: float
 ) -> GaussianArrays:
-    """Return the Gaussians of a mask without strays; the most visible ones, refined, if they are too many."""
+    """Return the Gaussians of a mask without strays; the most visible, fitted to pictures, if they are too many."""
     part, most = gaussians.rows(mask), edits.max_gaussians
     if most is not None and part.count > most:
         subset = gaussians.rows(most_visible(mask, most, run))
         # The fit must not bring back what an edit removed, floaters included.
-        picture = _renderer(part, run, display_time) if edits.changes_pictures else _photo_renderer(run, display_time)
-        part = refine(subset, picture, training_cameras(run)) if gaussians.color_model == "display" else subset
+        picture = (
+            _splat_renderer(part, run, display_time) if edits.changes_pictures else _photo_renderer(run, display_time)
+        )
+        part = fit_to_pictures(subset, picture, training_cameras(run)) if gaussians.color_model == "display" else subset
     return without_strays(part, training_cameras(run))
 
 
@@ -163,7 +166,7 @@ def _gaussians_in_colors(run: "RenderableScene", color_model: str, display_time:
         problem = f"does not fit into {run.device}, on which display colors are fitted to pictures"
         raise SehdrError(f"{run.path}: {problem}; use --device cpu, or kind hdr in a .ply")
     gaussians = gaussians_of(run.field, "display", positions, display_time, run.color_matrix)
-    return refine(gaussians, _photo_renderer(run, display_time), photos)
+    return fit_to_pictures(gaussians, _photo_renderer(run, display_time), photos)
 
 
 def _check(path: Path, kind: str, file_model: str | None, exposure_time: float | None, degree: int | None) -> None:
@@ -195,13 +198,13 @@ def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, disp
     if not views:
         log.info("not compared with the scene, because the file has no cameras")
     elif kind == "ldr":
-        decibels = agreement(_renderer(gaussians, run, display_time), _photo_renderer(run, display_time), views)
+        decibels = psnr_of(_splat_renderer(gaussians, run, display_time), _photo_renderer(run, display_time), views)
         words = loss_in_words(decibels)
         text = "kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white"
         log.info(text, decibels, where, words)
     else:
         times = display_time, display_time / 2**_DARKER
-        bright, dim = (agreement(_renderer(gaussians, run, t), _srgb_renderer(run, t), views) for t in times)
+        bright, dim = (psnr_of(_splat_renderer(gaussians, run, t), _srgb_renderer(run, t), views) for t in times)
         words = loss_in_words(min(bright, dim))
         text = "kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s (%s)"
         log.info(text, bright, dim, _DARKER, where, words)
@@ -219,8 +222,8 @@ def _log_file_loss(
     if part is None:
         reference, name = _photo_renderer(run, display_time), "the scene"
     else:
-        reference, name = _renderer(part, run, display_time), "what was exported"
-    decibels = agreement(_renderer(gaussians, run, display_time), reference, views)
+        reference, name = _splat_renderer(part, run, display_time), "what was exported"
+    decibels = psnr_of(_splat_renderer(gaussians, run, display_time), reference, views)
     files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
     size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
     log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, name, loss_in_words(decibels), size)
@@ -237,7 +240,7 @@ def _srgb_renderer(run: "RenderableScene", time: float) -> Callable:
     return lambda camera: encode(run.render(camera).hdr * time)
 
 
-def _renderer(gaussians: GaussianArrays, run: "RenderableScene", time: float) -> Callable:
+def _splat_renderer(gaussians: GaussianArrays, run: "RenderableScene", time: float) -> Callable:
     """Return a function that renders Gaussians in the scene's coordinates as sRGB, on the run's device."""
     field = on_device(field_of(gaussians), run.device)
     return lambda camera: field.render_ldr(camera, time)

@@ -10,7 +10,7 @@ from sehdr_warp.model.baking import field_of, gaussians_of
 from sehdr_warp.model.paged_field import PagedField
 from sehdr_warp.output.commands import Render, ViewFileOptions, run_render
 from sehdr_warp.output.export.commands import Convert, Export, run_convert, run_export
-from sehdr_warp.output.export.gaussians import _renderer, export
+from sehdr_warp.output.export.gaussians import _splat_renderer, export
 from sehdr_warp.output.images.display import display_gain, encode_srgb
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import Splats, load_splats
@@ -86,7 +86,7 @@ def test_colors_of_other_primaries_are_shown_as_srgb(tmp_path, run, logged):
 
 
 def test_colors_are_fitted_on_the_device_of_the_run(tmp_path, device):
-    renderer = _renderer(gaussians(degree=1), Splats(tmp_path, field_of(gaussians()).to(device), ()), 0.5)
+    renderer = _splat_renderer(gaussians(degree=1), Splats(tmp_path, field_of(gaussians()).to(device), ()), 0.5)
     assert renderer(camera()).device == torch.device(device)
 
 
