@@ -120,30 +120,6 @@ def test_moved_photos(run, tmp_path, capfd):
     assert call("render", run, "--out", tmp_path / "out", "--device", "cpu", "--cameras", "train") == 0
 
 
-def test_a_camera_file_that_cannot_be_used(embedded_run, tmp_path, capfd):
-    (tmp_path / "path.json").write_text('{"cameras": [7]}')
-    arguments = ("render", embedded_run, "--out", tmp_path / "out", "--device", "cpu")
-    assert "path.json" in refused(capfd, *arguments, "--cameras", tmp_path / "path.json")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    "flags, words",
-    [
-        (("--evs=",), "evs: the list is empty"),
-        (("--evs=1,x",), "evs:"),
-        (("--evs=0", "--exposures", "1"), "both are set"),
-        (("--multipart",), "exposures"),
-        (("--ldr-brackets", "jpeg"), "exposures"),
-        (("--cameras", "orbit", "--count", "0"), "path cannot have 0 views"),
-        (("--cameras", "interpolate", "--count", "100000000"), "path cannot have 100000000 views"),
-    ],
-)
-def test_render_flags(embedded_run, tmp_path, capfd, flags, words):
-    line = refused(capfd, "render", embedded_run, "--out", tmp_path / "out", "--device", "cpu", *flags)
-    assert words in line and not (tmp_path / "out").exists()
-
-
 def test_nothing_is_replaced(embedded_run, tmp_path, capfd):
     out = tmp_path / "out"
     arguments = ("render", embedded_run, "--out", out, "--device", "cpu", "--evs=-2,0")

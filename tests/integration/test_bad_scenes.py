@@ -233,26 +233,6 @@ def test_photos_of_noise_have_no_poses(tmp_path, capfd):
     assert [path.name for path in tmp_path.iterdir()] == ["noise"]
 
 
-EXPOSURES = {
-    "zero": '{"000.png": 0, "001.png": 1}',
-    "negative": '{"000.png": -1}',
-    "NaN": '{"000.png": NaN}',
-    "huge": '{"000.png": 1e999}',
-    "words": '{"000.png": "soon"}',
-    "not JSON": "{",
-    "nested": "[" * 100_000,
-    "a number": "3",
-    "empty": "",
-}
-
-
-@pytest.mark.parametrize("case", EXPOSURES)
-def test_exposure_times(data, capfd, case):
-    (data / "exposures.json").write_text(EXPOSURES[case])
-    line = train_refused(capfd, data)
-    assert "exposures.json" in line or "exposure time" in line
-
-
 def test_exposure_times_of_zero_in_exif_count_as_none(tmp_path):
     write_colmap(tmp_path / "data", name="{:03d}.jpg", exif={i: {33434: IFDRational(0, 1)} for i in range(6)})
     assert not load_scene(tmp_path / "data", response="srgb").exposure_times_known

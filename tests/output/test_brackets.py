@@ -33,6 +33,7 @@ def test_exposures_ascend_and_are_of_the_one_grammar():
         ({"evs": [0, float("nan")]}, "evs: nan is not a number of stops"),
         ({"exposures": [2, 1, "4x"]}, "exposures: 2 s appears twice"),
         ({"evs": [1, 1.0]}, "evs: 1 s appears twice"),
+        ({"evs": ""}, "evs: the list is empty"),
         ({"evs": "0,two"}, "evs: 'two' is not a number of stops; write numbers"),
         ({"exposures": [1e-30]}, "exposures: 1e-30 s .* is outside"),
     ],

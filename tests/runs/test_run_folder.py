@@ -140,8 +140,9 @@ def test_a_summary_of_another_shape_is_refused(run):
 
 @pytest.mark.parametrize("name", ["summary.json", "plan.json", "run.json", "scene.json", "config.json"])
 def test_what_is_not_an_object_is_refused(run, name):
-    for text in ("", "[]", "{", '{"iteration": NaN}', '{"a": 1, "a": 2}', "[" * 100_000):
-        (run / name).write_text(text)
+    texts = ["", "[]", "{", '{"iteration": NaN}', '{"a": 1, "a": 2}', "[" * 100_000, "9" * 5000, "\xff\xfe\0{"]
+    for text in [*texts, '{"a":' * 900 + "1" + "}" * 900]:
+        (run / name).write_bytes(text.encode("latin-1"))
         with pytest.raises(InputError, match=name):
             read_all(run)
 

@@ -4,7 +4,6 @@ import json
 import os
 import random
 import re
-import shutil
 import struct
 from pathlib import Path
 from typing import Any
@@ -15,62 +14,9 @@ from PIL import Image
 from tests.fuzz.mutate import VALUES
 
 from .harness import SEED, TRAIN, call, files_in
-from .hostile import DEEP, EITHER, FAR, IDENTITY, NAN, REFUSED, RENDER, STATE, case, put, tried
+from .hostile import DEEP, EITHER, NAN, REFUSED, RENDER, STATE, case, put, tried
 
 pytestmark = pytest.mark.trial
-VIEWS = ("views", 0)
-FIELDS = [
-    *(("scene.json", (*VIEWS, "camera", "width"), value) for value in (None, "a", [], {}, -1, 0, FAR, NAN, True, 2.5)),
-    *(("scene.json", (*VIEWS, "camera", "fx"), value) for value in (NAN, 0, -1.0, "x")),
-    *(("scene.json", (*VIEWS, "camera", "cx"), value) for value in (FAR, NAN)),
-    ("scene.json", (*VIEWS, "camera", "world_to_camera"), [[1, 2], [3]]),
-    ("scene.json", (*VIEWS, "camera", "world_to_camera"), [[NAN] * 4] * 4),
-    ("scene.json", (*VIEWS, "camera", "world_to_camera"), [[1, 0, 0, FAR], *IDENTITY[1:]]),
-    *(("scene.json", (*VIEWS, "name"), value) for value in ("../../x", "/x", "a/b", "..", "", "a\0b", "x" * 5000, 5)),
-    *(("scene.json", (*VIEWS, "exposure_time"), value) for value in (0, -1, NAN, "1/2", None)),
-    *(("run.json", ("base_time",), value) for value in (0, -1, NAN, "x", None)),
-    *(("run.json", ("response",), value) for value in (None, 5, "x", {}, {"kind": "file", "path": "/dev/zero"})),
-    *(("run.json", ("response",), {"kind": "analytic", "name": name}) for name in ("../x", "gamma-1e999", "gamma-0")),
-    *(("run.json", ("normalization", "unit"), value) for value in (NAN, 0, -1, "x")),
-    *(("run.json", ("up", "direction"), value) for value in ([NAN] * 3, [1], "y", [1, 0, 0, 0, 0])),
-    *(("run.json", ("format",), value) for value in (99, -1, "3", None, 3.5, 10**30)),
-    *(("config.json", ("model", "sh_degree"), value) for value in (-1, 9, 1e9, 10**12, "3", NAN)),
-    ("config.json", ("__class__",), "os.system"),
-]
-
-
-def rehash(space: Path) -> None:
-    """Make the hashes of a changed run fit: whoever sends a run can."""
-    from sehdr_warp.errors import SehdrError
-    from sehdr_warp.runs.run_folder import RunFolder
-
-    file = (space / "run" / STATE).with_name("checkpoint.json")
-    values = json.loads(file.read_text())
-    try:
-        values["run"] = RunFolder(space / "run").hashes()
-    except SehdrError:  # Not even JSON
-        return
-    file.write_text(json.dumps(values))
-
-
-@pytest.mark.parametrize(
-    ("file", "place", "value", "codes"),
-    [
-        case(
-            f"{file[:-5]}.{place[-1]} = {value!s:.24}", file, place, value, codes=EITHER if "name" in place else REFUSED
-        )
-        for file, place, value in FIELDS
-    ],
-)
-def test_fields_of_a_run(space, file, place, value, codes):
-    tree = at = json.loads((space / "run" / file).read_text())
-    for key in place[:-1]:
-        at = at.setdefault(key, {}) if isinstance(at, dict) else at[key]
-    at[place[-1]] = value
-    put(space / "run" / file, tree)
-    rehash(space)
-    tried(space, RENDER, codes)
-
 
 RUN_FILES = ("config.json", "scene.json", "run.json", "plan.json", "summary.json", "metrics.jsonl", "extension.json")
 RUN_FILES += ("confidence.safetensors", "orientation.json", "light_unit.json", "blocks.json")
@@ -85,18 +31,6 @@ def test_kinds_of_files_of_a_run(space, name, kind, line):
     put(space / "run" / name, kind)
     ended = tried(space, line, (1,))
     assert name in ended.err
-
-
-TEXTS = (DEEP, "null", "{}" * 1000, '{"a":' * 900 + "1" + "}" * 900, b"\xff\xfe\x00{", "9" * 5000, "")
-
-
-@pytest.mark.parametrize("name", ["run.json", "scene.json", "config.json", "summary.json", "plan.json"])
-@pytest.mark.parametrize("number", range(len(TEXTS)))
-def test_texts_of_a_run(space, name, number):
-    put(space / "run" / name, TEXTS[number])
-    reported = name in ("summary.json", "plan.json")
-    line = "report run --out new --device cpu" if reported else RENDER
-    tried(space, line, EITHER if reported and not TEXTS[number] else (1,))
 
 
 def tensors(**changes: Any):
@@ -238,48 +172,6 @@ def test_sets_that_changed_below_a_training(space, kind):
     ended = tried(space, line, codes=(0,) if kind in SAME else (0, 1), made=("run", "cache"))
     assert (ended.code == 0) == (kind in SAME), f"{kind}: went on without a word"
     assert ended.code == 0 or files_in(space / "run") == before
-
-
-DATA = [{"path": "/dev/zero"}, {"path": "a\0b"}, {"path": "n" * 100_000}, {"max_size": 10**400}, {"holdout": -1}]
-
-
-@pytest.mark.parametrize("number", range(len(DATA)))
-def test_load_arguments_of_a_run(space, number):
-    """State odd places of photos in a run."""
-    values = json.loads((space / "run" / "run.json").read_text())
-    values["data"] |= DATA[number]
-    (space / "run" / "run.json").write_text(json.dumps(values))
-    ended = tried(space, "eval run --device cpu")
-    assert "root:" not in ended.err
-
-
-LINKED_FILES = (
-    "config.json", "scene.json", "run.json", "plan.json", "summary.json", "metrics.jsonl", "confidence.safetensors",
-    "checkpoints", ".lock", "tensorboard", ".new", ".ready", "checkpoints/iteration_00000024/state.safetensors",
-)  # fmt: skip
-
-
-LOOKS = {
-    "render": "render run --out seen --device cpu", "compare": "compare run", "resume": RESUME,
-    "overwrite": " ".join([*TRAIN, "--overwrite"]),
-}  # fmt: skip
-"""Commands that open a run in different ways; export, eval, report and envmap do as render does."""
-
-
-@pytest.mark.parametrize("name", LINKED_FILES)
-@pytest.mark.parametrize("look", LOOKS)
-def test_links_in_a_sent_run(space, look, name):
-    """Each to something of the user's with that name, which would do."""
-    file, precious = space / "run" / name, space / "precious"
-    if file.exists():
-        shutil.move(file, precious)
-    else:
-        precious.mkdir()
-        (precious / "thesis.txt").write_text("mine")
-    file.symlink_to(os.path.relpath(precious, file.parent))
-    before = files_in(space)
-    ended = call(*LOOKS[look].split(), folder=space)
-    assert ended.code == 1 and "is a link" in ended.err.splitlines()[-1] and files_in(space) == before
 
 
 SCRIPT = "</script><script>PWNED</script><img src=x onerror=PWNED>"

@@ -1,9 +1,8 @@
-"""Files of Gaussians that are damaged, or were made to do harm."""
+"""Files of Gaussians that take much or were made to do harm. Damaged ones are tests of their readers."""
 
 import gzip
 import json
 import os
-import shutil
 import struct
 import zipfile
 import zlib
@@ -16,7 +15,7 @@ import pytest
 from PIL import Image
 
 from .harness import call
-from .hostile import CAMERA, DEEP, EITHER, FAR, NAN, REFUSED, case, put, tried
+from .hostile import CAMERA, DEEP, EITHER, NAN, REFUSED, case, put, tried
 
 pytestmark = pytest.mark.trial
 COLUMNS = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
@@ -31,8 +30,8 @@ def ply(
     return f"ply\nformat {kind}\n{extra}element vertex {count}\n{names}end_header\n".encode() + body
 
 
-def glb(*place: Any, value: Any = None, fill: float = 0.5) -> bytes:
-    """Two Gaussians as binary glTF, with another value at a place of the description."""
+def glb(nodes: Any = ({"mesh": 0},), fill: float = 0.5) -> bytes:
+    """Two Gaussians as binary glTF."""
     shapes = {"POSITION": "VEC3", "COLOR_0": "VEC4"}
     shapes |= {f"KHR_gaussian_splatting:{name}": kind for name, kind in (("ROTATION", "VEC4"), ("SCALE", "VEC3"))}
     shapes |= {"KHR_gaussian_splatting:OPACITY": "SCALAR", "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": "VEC3"}
@@ -46,28 +45,21 @@ def glb(*place: Any, value: Any = None, fill: float = 0.5) -> bytes:
     primitive = {"mode": 0, "attributes": {name: i for i, name in enumerate(shapes)}}
     tree: dict[str, Any] = {
         "meshes": [{"primitives": [primitive | {"extensions": {"KHR_gaussian_splatting": extension}}]}],
-        "nodes": [{"mesh": 0}], "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": offset}],
+        "nodes": list(nodes), "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": offset}],
     }  # fmt: skip
-    at: Any = tree
-    for key in place[:-1]:
-        at = at[key]
-    if place:
-        at[place[-1]] = value
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     head = struct.pack("<5I", 0x46546C67, 2, 28 + len(text) + offset, len(text), 0x4E4F534A)
     return head + text + struct.pack("<2I", offset, 0x4E4942) + struct.pack("<f", fill) * (offset // 4)
 
 
-def bomb(head: bytes = b"", size: int = 300_000_000) -> bytes:
+def bomb() -> bytes:
     packer = zlib.compressobj(9, zlib.DEFLATED, 31)
-    return (
-        packer.compress(head) + b"".join(packer.compress(bytes(10**7)) for _ in range(size // 10**7)) + packer.flush()
-    )
+    return b"".join(packer.compress(bytes(10**7)) for _ in range(30)) + packer.flush()
 
 
-def spz(count=2, version=2, degree=0, body: bytes | None = None) -> bytes:
-    head = struct.pack("<IIIBBBB", 0x5053474E, version, count, degree, 12, 0, 0)
+def spz(count=2, version=2, body: bytes | None = None) -> bytes:
+    head = struct.pack("<IIIBBBB", 0x5053474E, version, count, 0, 12, 0, 0)
     return gzip.compress(head + (bytes(40 * 2) if body is None else body))
 
 
@@ -94,13 +86,13 @@ def sog(changes: dict[str, Any] | None = None, files: dict[str, bytes] | None = 
     return packed.getvalue()
 
 
-def usd(body="", meta="", points="(0,0,0)", degree=0) -> bytes:
+def usd(body="", meta="", degree=0) -> bytes:
     return f"""#usda 1.0
 (
  defaultPrim = "A"
 {meta})
 def ParticleField3DGaussianSplat "A" {body} {{
- point3f[] positions = [{points}]
+ point3f[] positions = [(0,0,0)]
  float[] opacities = [0.5]
  quatf[] orientations = [(1,0,0,0)]
  float3[] scales = [(0.1,0.1,0.1)]
@@ -111,8 +103,6 @@ def ParticleField3DGaussianSplat "A" {body} {{
 
 
 NESTED = [{"children": [i + 1]} for i in range(10_000)] + [{"mesh": 0}]
-ATTRIBUTES = ("meshes", 0, "primitives", 0, "attributes")
-VIEW, ACCESSOR = ("bufferViews", 0), ("accessors", 0)
 SPLATS = [
     *(case(f"ply of {n} vertices", ".ply", partial(ply, n)) for n in (2**40, -1, 10**30, "x", "")),
     case("ply of none", ".ply", partial(ply, 0, body=b"")),
@@ -126,47 +116,20 @@ SPLATS = [
     case("ply of lists", ".ply", partial(ply, type="list uchar float")),
     case("ply, 100,000 columns", ".ply", lambda: ply(columns=[*COLUMNS, *(f"p{i}" for i in range(10**5))], body=b"")),
     case("ply, 1000 harmonics", ".ply", lambda: ply(columns=[*COLUMNS, *(f"f_rest_{i}" for i in range(1000))])),
-    case("ply, 7 harmonics", ".ply", lambda: ply(columns=[*COLUMNS, *(f"f_rest_{i}" for i in range(7))])),
     case("ply, escapes as model", ".ply", partial(ply, extra="comment sehdr:color_model \x1b[31m<script>\n")),
-    *(
-        case(f"ply, base time {t[:9]}", ".ply", partial(ply, extra=f"comment sehdr:base_exposure_time {t}\n"))
-        for t in ("nan", "-1", "0", "1e-320", "1e999", "1/0", "a" * 5000, "9" * 5000)
-    ),
-    *(
-        case(f"ply, matrix {m[:9]}", ".ply", partial(ply, extra=f"comment sehdr:world_matrix {m}\n"))
-        for m in ("nan " * 16, "1 " * 9, "x", "0 " * 16, "[" * 5000)
-    ),
-    *(
-        case(f"glb, {'.'.join(map(str, place))} = {value!s:.20}", ".glb", partial(glb, *place, value=value))
-        for place, value in (
-            *(((*ACCESSOR, "count"), value) for value in (2**40, -1, "x", FAR, 0)),
-            *(((*ACCESSOR, "bufferView"), value) for value in (-1, 99, "0", True)),
-            *(((*VIEW, "byteOffset"), value) for value in (-8, 2**63, "x")),
-            *(((*VIEW, "byteStride"), value) for value in (0, 1, -4, 2**40)),
-            *(((*VIEW, "buffer"), value) for value in (-1, 1)),
-            ((*ACCESSOR, "sparse"), {"count": 1}), ((*ACCESSOR, "componentType"), 9), ((*ACCESSOR, "type"), "MAT9"),
-            *((("buffers", 0, "uri"), uri) for uri in ("file:///etc/passwd", "http://127.0.0.1:9/x", "../x", "data:,")),
-            (("nodes", 0, "children"), [0]), (("nodes", 0, "matrix"), [NAN] * 16), (("nodes", 0, "scale"), [0, 0, 0]),
-            (("nodes",), [{"mesh": 0}] * 200_000), (("nodes", 0, "mesh"), -1), (("meshes",), "abc"), (ATTRIBUTES, []),
-            (("meshes", 0, "extras"), {"world_matrix": "x"}),
-        )
-    ),
-    case("glb, nested nodes", ".glb", partial(glb, "nodes", value=NESTED), codes=(0,)),
+    case("glb, nested nodes", ".glb", partial(glb, NESTED), codes=(0,)),
     case("glb of NaN", ".glb", partial(glb, fill=NAN)),
     case("glb, deep", ".glb", lambda: glb()[:20] + DEEP.encode()),
     case("glb, a chunk of 4 GiB", ".glb", lambda: glb()[:12] + b"\xff" * 4 + glb()[16:]),
     case("spz of 2^32 - 1", ".spz", partial(spz, 2**32 - 1, body=b"")),
     case("spz of 300 MB", ".spz", bomb),
     case("spz, version 77", ".spz", partial(spz, version=77)),
-    case("spz, degree 200", ".spz", partial(spz, degree=200)),
-    case("spz, cut", ".spz", lambda: spz()[:20]),
     case("spz of 100,000 parts", ".spz", lambda: spz() + gzip.compress(b"") * 100_000, codes=EITHER),
     *(
         case(f"sog, {place} = {value!s:.20}", ".sog", partial(sog, {place: value}))
         for place, value in (
-            ("count", 2**40), ("count", -1), ("count", "x"), ("means.mins", [NAN] * 3), ("version", 9),
-            ("means.files", ["/etc/passwd", "../x"]), ("sh0.files", ["http://127.0.0.1:9/a.webp"]),
-            ("scales.codebook", [1, 2]), ("scales.codebook", [0.0] * 10**6), ("sh0.codebook", ["a"] * 256),
+            ("count", 2**40), ("means.files", ["/etc/passwd", "../x"]), ("scales.codebook", [0.0] * 10**6),
+            ("sh0.files", ["http://127.0.0.1:9/a.webp"]),
             ("shN", {"count": 10**9, "bands": 3, "codebook": [0.0] * 256, "files": ["quats.webp", "sh0.webp"]}),
         )
     ),
@@ -180,9 +143,6 @@ SPLATS = [
     case("usd, itself", ".usda", partial(usd, "(references = @x.usda@</A>)"), codes=EITHER),
     case("usd, a device", ".usda", partial(usd, "(payload = @/dev/zero@</A>)"), codes=EITHER),
     case("usd, degree 10^9", ".usda", partial(usd, degree=10**9)),
-    case("usd, NaN", ".usda", partial(usd, points="(nan,0,0)")),
-    case("usd, lengths differ", ".usda", partial(usd, points="(0,0,0),(1,1,1)")),
-    case("usd, empty", ".usda", partial(usd, points="")),
     *(case(f"a page as {suffix}", suffix, lambda: b"<html>") for suffix in (".html", ".splat", ".ksplat", ".txt", "")),
 ]  # fmt: skip
 
@@ -221,57 +181,3 @@ def test_places_of_splats(space, content, line, codes):
 def _refused_unread(space: Path, line: str) -> None:
     ended = call(*line.split(), folder=space)
     assert ended.code == 1 and "GB of memory" in ended.err and ended.memory < 1500
-
-
-def node(**part):
-    return {"bound": {"min": [0, 0, 0], "max": [1, 1, 1]}, "lods": {"0": {"file": 0, "offset": 0, "count": 1} | part}}
-
-
-def circle(depth: int):
-    tree = node()
-    for _ in range(depth):
-        tree = {"bound": tree["bound"], "children": [tree]}
-    return tree
-
-
-STREAMED = {
-    "a chunk above": {"filenames": ["../../precious/meta.json"]},
-    "a chunk of the disk": {"filenames": ["/etc/passwd"]},
-    "a chunk of a device": {"filenames": ["/dev/zero"]},
-    "a chunk of 10^18": {"tree": node(file=10**18)},
-    "a count of 10^18": {"tree": node(count=10**18)},
-    "an offset below 0": {"tree": node(offset=-5)},
-    "a count of a text": {"tree": node(count="9" * 5000)},
-    "deep": {"tree": circle(400)},
-    "no tree": {"tree": None},
-    "names of numbers": {"filenames": [7]},
-    "no chunk": {"filenames": []},
-}
-
-
-@pytest.mark.parametrize("name", STREAMED)
-def test_indexes_of_streamed_sog(space, name):
-    meta = {"version": 1, "count": 1, "counts": [1], "lodLevels": 1, "filenames": ["0_0/meta.json"], "tree": node()}
-    (space / "town").mkdir()
-    (space / "town" / "lod-meta.json").write_text(json.dumps(meta | STREAMED[name]))
-    ended = tried(space, "convert town/lod-meta.json seen.ply", codes=(1,))
-    assert "root:" not in ended.err
-
-
-COMPRESSED = {
-    "chunks of 10^12": (b"element chunk 1", b"element chunk 1000000000000"),
-    "an element below 0": (b"element vertex ", b"element vertex -"),
-    "no format": (b"format binary_little_endian 1.0\n", b""),
-    "bounds of another type": (b"property float min_x", b"property double min_x"),
-    "bounds of another name": (b"property float max_z", b"property float max_q"),
-}
-
-
-@pytest.mark.parametrize("name", COMPRESSED)
-def test_headers_of_compressed_ply(space, name):
-    data = (space / "files" / "a.compressed.ply").read_bytes()
-    old, new = COMPRESSED[name]
-    assert old in data
-    (space / "b.compressed.ply").write_bytes(data.replace(old, new, 1))
-    shutil.rmtree(space / "files")
-    tried(space, "convert b.compressed.ply seen.ply", codes=(1,))
