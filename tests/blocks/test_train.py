@@ -131,22 +131,9 @@ def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capf
     assert "has 2 blocks, but 3 were asked for" in line("--out", merged, "--blocks", "3", "--resume", *FLAGS)
     assert "schedule.iterations = " in line("--out", merged, "--resume", "--iterations", "999", "--preset", "fast")
     assert "too few for 9 blocks" in line("--out", tmp_path / "run", "--blocks", "9")
-    assert "--blocks with fusion.enabled" in refused(
-        capfd,
-        "train",
-        survey,
-        "--out",
-        tmp_path / "run",
-        "--blocks",
-        "2",
-        "--fusion.enabled",
-        "true",
-        "--device",
-        "cpu",
-    )
-    assert "learned response" in refused(
-        capfd, "train", survey, "--out", tmp_path / "run", "--blocks", "2", "--response", "learned", "--device", "cpu"
-    )
+    new = ["train", survey, "--out", tmp_path / "run", "--blocks", "2", "--device", "cpu"]
+    assert "--blocks with fusion.enabled" in refused(capfd, *new, "--fusion.enabled", "true")
+    assert "learned response" in refused(capfd, *new, "--response", "learned")
     assert not (tmp_path / "run").exists()
     capfd.readouterr()
     wrong = (["--blocks", "1"], ["--blocks", "many"], ["--blocks", "9" * 5000], ["--slurm", "partition=gpu"])

@@ -251,25 +251,6 @@ def test_values_that_cannot_be(data, capfd, flag, value, words):
     assert words in train_refused(capfd, data, flag, value)
 
 
-TRANSFORMS = {
-    "empty": "",
-    "not JSON": "{",
-    "a list": "[]",
-    "nested": '{"frames": ' + "[" * 100_000,
-    "no frames": '{"frames": []}',
-    "frames are numbers": '{"frames": [1, 2]}',
-    "path leaves": '{"camera_angle_x": 1, "frames": [{"file_path": "../../etc/passwd", "transform_matrix": []}]}',
-    "path is a number": '{"camera_angle_x": 1, "frames": [{"file_path": 7}]}',
-    "no matrix": '{"camera_angle_x": 1, "frames": [{"file_path": "images/r_0"}]}',
-}
-
-
-@pytest.mark.parametrize("case", TRANSFORMS)
-def test_transforms(frames, capfd, case):
-    (frames / "transforms.json").write_text(TRANSFORMS[case])
-    assert "transforms.json" in train_refused(capfd, frames)
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, "x", None, "stretched", "mirrored", "no axis"])
 def test_a_frame_without_a_place_is_left_out(frames, value):
     with edited_json(frames / "transforms.json") as values:

@@ -177,17 +177,10 @@ def test_numpy_in_numpy_out(response):
 @pytest.mark.parametrize(
     "name",
     [
-        "gamma-0",
-        "gamma-0.5",
-        "gamma-x",
-        "gamma-nan",
-        "sRGB-ish",
-        "",
-        "no/such/file.csv",
-        "colour:S-Log9",
+        "gamma-0", "gamma-0.5", "gamma-x", "gamma-nan", "sRGB-ish", "", "no/such/file.csv", "colour:S-Log9",
         "colour:DICOM GSDF",
     ],
-)
+)  # fmt: skip
 def test_unknown_names_are_refused(name):
     with pytest.raises(SehdrError) as error:
         response_by_name(name)

@@ -41,22 +41,11 @@ def masks_said(scene):
 @pytest.mark.parametrize(
     "name",
     [
-        "masks/{}.png.png",
-        "masks/{}.png",
-        "masks/{}.jpg",
-        "masks/{}.PNG",
-        "masks/{}_mask.png",
-        "masks/{}.mask.png",
-        "masks/mask_{}.png",
-        "mask/{}.png",
-        "masks/images/{}.png",
-        "images/{}_mask.png",
-        "images/masks/{}.png",
-        "images/{}-removebg.png",
-        "images_mask/{}-removebg-preview.png",
-        "Masks/{}.png",
+        "masks/{}.png.png", "masks/{}.png", "masks/{}.jpg", "masks/{}.PNG", "masks/{}_mask.png", "masks/{}.mask.png",
+        "masks/mask_{}.png", "mask/{}.png", "masks/images/{}.png", "images/{}_mask.png", "images/masks/{}.png",
+        "images/{}-removebg.png", "images_mask/{}-removebg-preview.png", "Masks/{}.png",
     ],
-)
+)  # fmt: skip
 def test_names_of_masks(tmp_path, name):
     write_colmap(tmp_path)
     for i in range(6):

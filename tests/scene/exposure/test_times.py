@@ -27,15 +27,10 @@ def seconds(dataset):
 @pytest.mark.parametrize(
     "text, number",
     [
-        ("8 ms", 0.008),
-        ("8ms", 0.008),
-        ("1/125 s", 0.008),
-        ("8000 µs", 0.008),
-        ("0,5s", 0.5),
-        ("8 min", None),
-        ("s", None),
+        ("8 ms", 0.008), ("8ms", 0.008), ("1/125 s", 0.008), ("8000 µs", 0.008), ("0,5s", 0.5),
+        ("8 min", None), ("s", None),
     ],
-)
+)  # fmt: skip
 def test_numbers_with_units(text, number):
     assert parse_number(text) == (None if number is None else pytest.approx(number))
 

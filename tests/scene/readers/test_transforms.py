@@ -71,16 +71,7 @@ def test_frame_values_win_over_the_files(tmp_path):
     "fields, model, bent",
     [
         (
-            {
-                "camera_model": "FULL_OPENCV",
-                "k1": 0.1,
-                "k2": 0.2,
-                "k3": 0.3,
-                "k4": 0.4,
-                "k5": 0.5,
-                "k6": 0.6,
-                "p1": 1e-3,
-            },
+            {"camera_model": "FULL_OPENCV", "p1": 1e-3} | {f"k{n}": n / 10 for n in range(1, 7)},
             "FULL_OPENCV",
             (0.1, 0.2, 1e-3, 0, 0.3, 0.4, 0.5, 0.6),
         ),
@@ -217,12 +208,11 @@ def test_photos_that_are_trained_on_are_not_held_out(tmp_path, place, new):
     (tmp_path / "transforms.json").unlink()
     if place != "images":
         shutil.copytree(tmp_path / "images", tmp_path / place)
-    trained = 11 - new
     tested = [frame | {"file_path": frame["file_path"].replace("images", place)} for frame in values["frames"]]
-    for split, frames in (("train", values["frames"][:trained]), ("test", tested)):
+    for split, frames in (("train", values["frames"][: 11 - new]), ("test", tested)):
         (tmp_path / f"transforms_{split}.json").write_text(json.dumps(values | {"frames": frames}))
     scene = load(tmp_path)
-    assert any(line.startswith(f"{trained} test photos are training photos, too") for line in scene.notes), scene.notes
+    assert any(line.startswith(f"{11 - new} test photos are training photos, too") for line in scene.notes), scene.notes
     assert [view.name[-3:] for view in scene.test_views] == (["r_9", "_10"] if new else ["r_4"])
     assert len(scene.train_views) == (9 if new else 10)
 
@@ -262,6 +252,16 @@ def test_bad_transforms_are_refused(tmp_path, fields, message):
     _edit(tmp_path, **fields)
     with pytest.raises(InputError, match=message):
         load(tmp_path)
+
+
+def test_transforms_of_another_shape_are_refused(tmp_path):
+    write_blender(tmp_path)
+    texts = ["", "{", "[]", '{"frames": ' + "[" * 100_000, '{"frames": []}', '{"frames": [1, 2]}']
+    frames = {"file_path": "../../etc/passwd", "transform_matrix": []}, {"file_path": 7}, {"file_path": "images/r_0"}
+    for text in [*texts, *(json.dumps({"camera_angle_x": 1, "frames": [frame]}) for frame in frames)]:
+        (tmp_path / "transforms.json").write_text(text)
+        with pytest.raises(InputError, match=r"transforms\.json"):
+            load(tmp_path)
 
 
 def test_exr_among_photos_is_refused_and_beside_one_is_truth(tmp_path):
