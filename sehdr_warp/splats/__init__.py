@@ -79,7 +79,7 @@ def path_is_lossy(path: Path | str) -> bool:
     return FORMATS[check_suffix(path)].is_lossy
 
 
-def color_model_of(path: Path | str) -> str | None:
+def required_color_model(path: Path | str) -> str | None:
     """Return the one color model that a file of this suffix can hold; None if it can hold any (PLY)."""
     return FORMATS[check_suffix(path)].color_model
 
@@ -125,10 +125,10 @@ def write_gaussians(path: Path | str, gaussians: GaussianArrays, *, overwrite: b
 
     Raises:
         InputError: If a value is NaN or infinite (with field and index), the file exists (unless overwrite), or the
-            format cannot hold these colors (see color_model_of).
+            format cannot hold these colors (see required_color_model).
         SehdrError: If the file cannot be written.
     """
-    color_model = color_model_of(path)
+    color_model = required_color_model(path)
     if color_model not in (None, gaussians.color_model):
         problem = f"holds {color_model} colors, and these are {gaussians.color_model}"
         raise InputError(path, problem, "choose another suffix, or let export change the colors")
@@ -154,8 +154,8 @@ __all__ = [
     "cameras_beside",
     "check_new_file",
     "check_suffix",
-    "color_model_of",
     "path_is_lossy",
     "read_gaussians",
+    "required_color_model",
     "write_gaussians",
 ]

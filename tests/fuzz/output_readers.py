@@ -16,7 +16,7 @@ from sehdr_warp.output.images.ocio import ocio_view
 from sehdr_warp.own_files import LIST
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_cameras
-from sehdr_warp.splats import USD_SUFFIXES, GaussianArrays, color_model_of, read_gaussians, write_gaussians
+from sehdr_warp.splats import USD_SUFFIXES, GaussianArrays, read_gaussians, required_color_model, write_gaussians
 from tests.ocio_config import ocio_config
 from tests.output.helpers import camera
 
@@ -53,7 +53,7 @@ def make_splats(*suffixes: str) -> Callable[[Path], None]:
         arrays = [np.full((3, *shape), 0.25, np.float32) for shape in ((3,), (3,), (4,), (), (4, 3))]
         for suffix in suffixes:
             file = folder / f"a{suffix}"
-            write_gaussians(file, GaussianArrays(*arrays, color_model_of(file) or "linear", 0.5))
+            write_gaussians(file, GaussianArrays(*arrays, required_color_model(file) or "linear", 0.5))
         if ".usda" in suffixes:
             (folder / "b.usda").write_text(usd_cameras([("a", camera(16, 12)), ("b", camera(8, 8))], np.eye(4)))
         (folder / LIST).unlink()

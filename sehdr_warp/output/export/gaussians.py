@@ -22,9 +22,9 @@ from ...splats import (
     camera_file_of,
     check_new_file,
     check_suffix,
-    color_model_of,
     path_is_lossy,
     read_gaussians,
+    required_color_model,
     write_gaussians,
 )
 from ...subsets import every_nth, first_names
@@ -91,7 +91,7 @@ def export(
     """
     refuse_paths("load_run", run)
     path, edits = Path(path), edits or SplatEdits()
-    file_model = color_model_of(path)
+    file_model = required_color_model(path)
     kind = kind or ("hdr" if file_model == "linear" else "ldr")
     _check(path, kind, file_model, exposure_time, degree)
     check_new_file(path, cameras=cameras, overwrite=overwrite)  # Before minutes of fitting
@@ -100,9 +100,9 @@ def export(
     # Regions of edits are in the coordinates of `axes`, before a file with -Y up is turned over.
     to_axes = _turned(run, path) if axes is None else world_transform(run, axes, up=up, scale=scale)
     to_file = file_transform(to_axes, path) if axes == "upright" else to_axes
-    seconds = run.base_time if exposure_time is None else float(exposure_time)
+    exposure_time = run.base_time if exposure_time is None else float(exposure_time)
     # Colors that are converted to Rec.709 are encoded by sRGB, at the exposure that shows middle grey as the photos do.
-    display_time = seconds if run.color_matrix is None else seconds * display_gain(run.response)
+    display_time = exposure_time * (1.0 if run.color_matrix is None else display_gain(run.response))
     hdr_model = file_model or ("linear" if run.field.color_model.name == "linear" else "log")
     means = run.field.gaussians.means.detach().cpu().numpy()
     edits.check_regions(to_axes.points(run.field.normalization.scene_points(means)))  # Before minutes of fitting
@@ -121,7 +121,7 @@ def export(
     elif overwrite and not (to_file.is_identity and Path(run.path).resolve() == path.resolve()):
         # Cameras of an earlier export would count as these Gaussians'. Those of a file edited in place still fit it.
         remove_earlier(path.parent, [camera_file_of(path).name])
-    meaning = f"display colors of {shutter(seconds)}" if kind == "ldr" else "scene-linear radiance"
+    meaning = f"display colors of {shutter(exposure_time)}" if kind == "ldr" else "scene-linear radiance"
     log.info("%s: %d Gaussians, harmonics of degree %d, %s", path.name, in_file.count, in_file.degree, meaning)
     compared, note = (gaussians, ", before the cut") if edits.shows_part else (edited, "")
     _log_loss(run, compared, kind, display_time, note)
