@@ -25,10 +25,11 @@ CURVE_STOPS, CURVE_SIZE = (-20.0, 20.0), 1024  # As light.js has them
 def curve_table(response: Any) -> str:
     """Return a response over CURVE_STOPS of exposure, evenly sampled, as half floats in base64.
 
-    Pages draw the camera's look with it.
+    Pages draw the camera's look with it. It is green's if a learned response differs by channel.
     """
-    values = response.encode(2.0 ** np.linspace(*CURVE_STOPS, CURVE_SIZE))
-    return base64.b64encode(np.asarray(values).astype("<f2").tobytes()).decode()
+    exposures = 2.0 ** np.linspace(*CURVE_STOPS, CURVE_SIZE)
+    values = np.asarray(response.encode(exposures[:, None].repeat(3, 1)))[:, 1]
+    return base64.b64encode(values.astype("<f2").tobytes()).decode()
 
 
 def photo_light(run: "RenderableScene", view: View) -> np.ndarray:

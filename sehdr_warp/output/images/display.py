@@ -30,9 +30,9 @@ def encode_srgb(linear: np.ndarray) -> np.ndarray:
 def display_gain(response: Any) -> float:
     """Return the factor from exposures of a response to display light that shows a photo's middle grey as middle grey.
 
-    It is 1 for an sRGB or linear camera.
+    It is 1 for sRGB's curve, which RAW and linear photos get, and green's if a learned response differs by channel.
     """
-    grey = float(response.decode(encode_srgb(np.array([MIDDLE_GREY])).astype(np.float64))[0])
+    grey = float(response.decode(encode_srgb(np.full((1, 3), MIDDLE_GREY)).astype(np.float64))[0, 1])
     return MIDDLE_GREY / grey if grey > 0 else 1.0
 
 

@@ -21,12 +21,14 @@ from PIL import Image
 
 from sehdr_warp import output
 from sehdr_warp.output.images.display import display_gain
+from sehdr_warp.output.light_pictures import CURVE_SIZE, CURVE_STOPS, curve_table
 from sehdr_warp.output.notebook import run_html
 from sehdr_warp.output.report.comparison import Comparison, darker_stops, first_picture
 from sehdr_warp.output.report.diagrams import training_svg
 from sehdr_warp.output.report.write import write_report
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.response import response_by_name
+from sehdr_warp.response.learned import ToneMapper
 
 from ...viewer.browser import browser, page_of
 from ..helpers import AnalyticRun
@@ -126,9 +128,15 @@ def test_the_pictures_keep_the_light_and_look_like_photos(tmp_path):
 
 def test_middle_grey_of_the_photo_is_shown_as_middle_grey():
     assert display_gain(response_by_name("srgb")) == pytest.approx(1, rel=1e-4)
-    response = response_by_name("hdr-nerf")
-    grey = response.encode(np.array([0.18 / display_gain(response)]))
-    assert grey[0] == pytest.approx(0.4614, abs=1e-3)
+    for response in (response_by_name("hdr-nerf"), ToneMapper()):
+        grey = response.encode(np.full((1, 3), 0.18 / display_gain(response)))
+        assert grey[0, 1] == pytest.approx(0.4614, abs=1e-3)
+
+
+def test_the_curve_of_pages_is_that_of_a_learned_response():
+    stops, response = np.linspace(*CURVE_STOPS, CURVE_SIZE), ToneMapper()
+    table = np.frombuffer(base64.b64decode(curve_table(response)), "<f2")
+    np.testing.assert_allclose(table, response.encode(2.0 ** stops[:, None].repeat(3, 1))[:, 1], atol=1e-3)
 
 
 def test_a_run_shows_itself_in_a_notebook():
