@@ -18,7 +18,7 @@ NOT_FINITE_REMEDY = "it is not written; train again from an earlier checkpoint o
 
 _ARGUMENTS = {
     **{f"--{name}": f"{name}=True" for name in ("resume", "overwrite", "inpaint")},
-    **{f"--{name}": name for name in ("holdout", "evs", "axes", "up", "scale", "crop", "at", "beyond", "ocio")},
+    **{f"--{name}": name for name in ("holdout", "evs", "axes", "up", "scale", "crop", "at", "beyond", "ocio", "view")},
     "--camera": "camera",
     "--cameras": "cameras",
     "--max-size": "max_size",

@@ -187,7 +187,7 @@ def check_options(
         raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
     check_pixel_type(pixel)
     if (ocio is None) != (view is None):
-        need = "previews through OpenColorIO need --ocio, a config, and view, one of its views"
+        need = "previews through OpenColorIO need --ocio, a config, and --view, one of its views"
         raise SehdrError(f"{need}; --camera chooses the view of a photo")
 
 

@@ -129,6 +129,8 @@ def test_a_film_says_how_long_it_is(tmp_path, monkeypatch, capsys, caplog):
     run_render(Render(run=tmp_path, video=tmp_path / "b.mp4"))
     assert capsys.readouterr().out == f"{tmp_path / 'b.mp4'}: 1 frame, 0.0417 s\n"
     assert "'test' is one camera, so one frame; --cameras orbit is a path" in caplog.text
+    run_render(Render(run=tmp_path, video=tmp_path / "c.mp4", camera=run.cameras[0].name))
+    assert f"'{run.cameras[0].name}' is one camera" in caplog.text
 
 
 def test_refusals(tmp_path, monkeypatch):

@@ -330,8 +330,13 @@ def test_several_cameras_are_chosen_from_by_name(tmp_path):
     photo = run.cameras[-1]
     for split in ("train", "test", "all"):
         assert select_cameras(run, split, camera=photo.name) == [(photo.name, photo.camera)]
-    with pytest.raises(SehdrError, match=f"the run has no camera '{photo.name}x', did you mean {photo.name}"):
-        select_cameras(run, "test", camera=f"{photo.name}x")
+    for cameras, message in (
+        (run.cameras, rf"one of the scene's.*did you mean {photo.name}"),
+        ([], "no cameras, and so"),
+    ):
+        run.cameras = cameras
+        with pytest.raises(SehdrError, match=message):
+            select_cameras(run, "test", camera=f"{photo.name}x")
     assert len(load_cameras(tmp_path / "c.json")) == 5
 
 

@@ -32,8 +32,11 @@ def split_or_all(run: "RenderableScene", split: str) -> list[Camera]:
 def camera_named(run: "RenderableScene", name: str) -> Camera:
     """Return the camera of a view; raise SehdrError if the scene has none of this name."""
     cameras = {entry.name: entry.camera for entry in run.cameras}
+    if not cameras:
+        remedy = "give a run, or keep what `export --cameras` writes beside a file"
+        raise SehdrError(f"{run.path}: has no cameras, and so no view {name!r}; {remedy}")
     if name not in cameras:
-        some = first_names(list(cameras), 5) or "none"
+        some = first_names(list(cameras), 5)
         hint = did_you_mean(name, cameras) or "; see scene.json of the run"
         raise SehdrError(f"view {name!r} is not one of the scene's ({some}){hint}")
     return cameras[name]
