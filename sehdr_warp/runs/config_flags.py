@@ -51,7 +51,8 @@ def parse_field(path: str, text: str):
     """
     kind: Any = dict(config_fields())[path].annotation
     if get_origin(kind) is tuple:
-        return tuple(_parse(get_args(kind)[0], item) for item in map(str.strip, text.split(",")) if item)
+        item_kind = get_args(kind)[0].__origin__  # Without its range, which the config explains
+        return tuple(_parse(item_kind, item) for item in map(str.strip, text.split(",")) if item)
     return _parse(kind, text)
 
 

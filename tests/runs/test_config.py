@@ -167,7 +167,7 @@ def test_a_gone_field_of_version_0_2_is_named(tmp_path):
         ("fusion.exposures", "1/8x, 1x", ("1/8x", "1x")),
         ("response.name", "201", "201"),
         ("schedule.evaluate_at", "100,200", (100, 200)),
-        ("schedule.evaluate_at", "100,2OO", (100, "2OO")),
+        ("schedule.evaluate_at", "-1,2OO", (-1, "2OO")),
         ("loss.clipping", "false", False),
         ("loss.clipping", "perhaps", "perhaps"),
         ("optimizer.means", "1e-4", 1e-4),
