@@ -29,9 +29,11 @@ log = logging.getLogger(__name__)
 # by which half of a photo may differ from the others (of stacks by six cameras at most 0.5, 0.4 to 3 if one is turned).
 CHANNELS_DIFFER, WRONG_TIME, OTHER_SCENE = 0.15, 0.25, 0.55
 CSV_ROWS = 1024  # Of a file with a column for each channel
-# What makes photos a stack: the least factor between times, and the least rank correlation in thumbnails of this side
-# over the pixels that neither clips. Real stacks correlate by 0.98 and more, photos from different places by 0.9.
-LEAST_STEP, LEAST_ALIKE, THUMBNAIL, LEAST_SHOWN, MOST_OF_STACK = 1.4, 0.96, 64, 0.05, 32
+# What makes photos a stack: the least factor between the brightest and the darkest, and, sorted by brightness, the
+# least median and minimum of rank correlations between thumbnails of this side, where neither clips. Two pairs at least
+# must show a fifth of their pixels unclipped. This sees 33 of 40 stacks by other people, and none in 76 folders of
+# other photos. Medians of those stacks are 0.97 and more; videos from one place have that, but not the brightness.
+BRIGHTER, ALIKE, LEAST_ALIKE, THUMBNAIL, LEAST_SHOWN, MOST_OF_STACK = 1.3, 0.96, 0.85, 64, 0.2, 32
 
 
 def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list[Path], Sequence[float]]:
@@ -57,48 +59,50 @@ def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list
 
 
 def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
-    """Raise InputError if photos are an exposure stack.
-
-    In a stack each time differs from the others by a factor, and photos rank the brightness of places alike.
-    """
+    """Raise InputError if photos are an exposure stack: they differ in brightness, and rank that of places alike."""
     if len(photos) > MOST_OF_STACK or any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
         return
     try:
-        records, times_known, _ = with_exposure_times(
-            [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in photos], folder
-        )
-        records = sorted(records, key=lambda record: record.seconds)
-        steps = [b.seconds / a.seconds for a, b in pairwise(records)]
-        times_known = times_known and all(record.time_known for record in records)
-        if not times_known or min(steps) < LEAST_STEP or not all(starmap(_alike, pairwise(_thumbnails(records)))):
-            return
+        pictures = sorted(map(_thumbnail, photos), key=np.mean)
     except (InputError, *PILLOW_ERRORS):
         return  # The readers of these photos report what is wrong with them.
-    span = f"{shutter(records[0].seconds)} to {shutter(records[-1].seconds)}"
-    problem = f"its {len(photos)} photos are an exposure stack from one place ({span}), which does not show depth"
+    alike = [each for each in starmap(_likeness, pairwise(pictures)) if each is not None]
+    brighter = pictures[-1].mean() > BRIGHTER * pictures[0].mean()
+    if not brighter or len(alike) < 2 or np.median(alike) < ALIKE or min(alike) < LEAST_ALIKE:
+        return
+    records = [ImageRecord(file.stem, file, UNPLACED, np.eye(4)) for file in photos]
+    records, times_known, _ = with_exposure_times(records, folder)
+    times = sorted(record.seconds for record in records)
+    times_known = times_known and all(record.time_known for record in records)
+    span = f" ({shutter(times[0])} to {shutter(times[-1])})" if times_known else ""
+    problem = f"its {len(photos)} photos are an exposure stack from one place{span}, which does not show depth"
     command = f"`sehdr-warp calibrate {shlex.quote(str(photos[0].parent))} --out camera.csv`"
     remedy = f"take photos from different places; {command} finds the camera's response in the stack"
     raise InputError(folder, problem, remedy)
 
 
-def _thumbnails(records: Sequence[ImageRecord]) -> Iterator[np.ndarray]:
-    for record in records:
-        with open_image(record.image) as image:
-            small = image.convert("L")
-            small.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
-            yield np.asarray(small)
+def _thumbnail(photo: Path) -> np.ndarray:
+    with open_image(photo) as image:
+        image.draft("L", (2 * THUMBNAIL, 2 * THUMBNAIL))
+        small = image.convert("L")
+        small.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+        return np.asarray(small)
 
 
-def _alike(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether thumbnails rank the brightness of places alike, except black and white ones."""
+def _likeness(one: np.ndarray, other: np.ndarray) -> float | None:
+    """Return how alike thumbnails rank the brightness of places, up to 1; None if too few are neither black nor white.
+
+    Thumbnails of different shapes return 0.
+    """
     if one.shape != other.shape:
-        return False
+        return 0.0
     exposed = (np.minimum(one, other) > 8) & (np.maximum(one, other) < 247)
     if exposed.mean() < LEAST_SHOWN:
-        return False
+        return None
     from scipy.stats import rankdata
 
-    return bool(np.corrcoef(rankdata(one[exposed]), rankdata(other[exposed]))[0, 1] >= LEAST_ALIKE)
+    ranks = rankdata(one[exposed]), rankdata(other[exposed])
+    return float(np.corrcoef(*ranks)[0, 1]) if min(map(np.ptp, ranks)) > 0 else 0.0
 
 
 def calibrate(

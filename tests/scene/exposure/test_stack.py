@@ -51,12 +51,24 @@ def test_a_stack_from_one_place_is_told_before_it_is_matched(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "times",
+    [
+        (1.0, 1.0, 8.0),
+        (0.5, 0.63, 0.8, 1.0, 1.26, 1.6),  # Thirds of stops
+        (0.004, 0.125, 0.5, 2.0, 8.0, 500.0),  # Black and white ones at the ends
+        (0.125, None, 8.0),
+    ],
+)
+def test_any_steps_between_the_times_make_a_stack(tmp_path, times):
+    with pytest.raises(InputError, match=f"{len(times)} photos are an exposure stack from one place"):
+        load_scene(write_photos(tmp_path / "photos", times))
+
+
+@pytest.mark.parametrize(
     ("times", "shift"),
     [
         ((0.125, 1.0, 8.0), 12),
-        ((1.0, 1.0, 8.0), 0),
         ((1.0, 1.2, 1.4), 0),
-        ((0.125, None, 8.0), 0),
         ((None, None, None), 0),
     ],
 )
