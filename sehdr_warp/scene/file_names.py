@@ -18,6 +18,7 @@ from .photo_names import fold_name
 
 MASK_FOLDERS = ("masks", "mask", "images_mask")  # Folders of masks of a set, in any case
 OTHER_FOLDERS = (*MASK_FOLDERS, "hdr", "exr")  # Folders of pictures that are not photos
+GEOMETRY_FOLDERS = ("depth", "depths", "confidence", "normals")  # Folders of pictures that nothing reads
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 """Folders of photos, from the full size to reduced copies."""
 LOOKED_FOR = 20  # Images of a set by whose names their folder is found

@@ -7,7 +7,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..subsets import counted, first_names
 from .dataparser import ImageRecord
-from .file_names import IMAGE_FOLDERS, is_system_file, natural_key, without_mask_mark
+from .file_names import GEOMETRY_FOLDERS, IMAGE_FOLDERS, is_system_file, list_images, natural_key, without_mask_mark
 from .images.heif import HEIF_SUFFIXES, heif_installed
 from .images.ldr_files import PHOTO_SUFFIXES
 from .photo_names import bases_of
@@ -73,6 +73,12 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         notes.append(f"{links} to no file: {first_names([file.name for file in broken])}")
     if others:
         notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
+    inside = (image.parent.parent for image in images if image.parent.is_relative_to(folder))
+    above = {folder, *inside} - {folder.parent}
+    geometry = sorted(place for each in above for place in each.iterdir() if place.name.lower() in GEOMETRY_FOLDERS)
+    counts = [(place, len(list_images(place, PHOTO_SUFFIXES))) for place in geometry if place.is_dir()]
+    if parts := [f"{place.relative_to(folder).as_posix()} ({count})" for place, count in counts if count]:
+        notes.append(f"not used, because depth and normals come from the photos alone: pictures of {', '.join(parts)}")
     return notes
 
 

@@ -49,6 +49,18 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     assert not said(load(tmp_path / "plain"), "in no view") and not said(load(tmp_path / "plain"), "not read")
 
 
+def test_pictures_of_depth_and_normals_are_named(tmp_path):
+    write_colmap(tmp_path)
+    for name in ("Depth", "normals", "hdr"):
+        (tmp_path / name).mkdir()
+    assert not said(load(tmp_path), "alone")
+    for name in ("Depth/000.png", "Depth/001.png", "normals/000.png"):
+        Image.fromarray(pattern(64, 48)).save(tmp_path / name)
+    assert said(load(tmp_path), "alone") == [
+        "not used, because depth and normals come from the photos alone: pictures of Depth (2), normals (1)"
+    ]
+
+
 def test_files_of_cameras_beside_photos_are_named(tmp_path):
     write_colmap(tmp_path)
     (tmp_path / "gt_cameras").mkdir()

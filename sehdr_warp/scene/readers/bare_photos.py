@@ -17,7 +17,7 @@ from ...errors import InputError
 from ...subsets import all_names, counted, first_names
 from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto
 from ..exposure.stack import refuse_stack
-from ..file_names import OTHER_FOLDERS, image_folder, is_system_file, list_images
+from ..file_names import GEOMETRY_FOLDERS, OTHER_FOLDERS, image_folder, is_system_file, list_images
 from ..images.heif import HEIF_SUFFIXES, register_heif
 from ..images.ldr_files import PHOTO_SUFFIXES
 from ..photo_names import fold_name, photo_labels
@@ -36,7 +36,7 @@ from .transforms import is_transforms
 _log = logging.getLogger("sehdr_warp.scene")
 
 _DEEPEST = 3  # Levels of folders in which photos are looked for
-_NO_PHOTOS = (*OTHER_FOLDERS, "depth", "depths", "confidence", "normals", "thumbnails")  # Folders of other pictures
+_NO_PHOTOS = (*OTHER_FOLDERS, *GEOMETRY_FOLDERS, "thumbnails")  # Folders of other pictures
 # Files and folders by which a program states cameras, in lower case.
 _POSE_FILES = {
     "cameras.xml": "Metashape", "bundle.out": "Bundler", "bundle.rd.out": "Bundler", "sfm_data.json": "OpenMVG",
