@@ -1,6 +1,7 @@
 """The response of a scene's photos: what files state, what the user names, or what fits the photos best."""
 
 import logging
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError, SehdrError
-from ..subsets import counted, every_nth
+from ..subsets import counted, every_nth, first_names
 from .dataparser import DataparserOutputs
-from .images.exif import are_camera_jpegs
+from .images.exif import are_camera_jpegs, exif_lens
 from .images.gain_map import MOST_STOPS_IN_CODES, read_gain_map
 from .images.ldr_files import has_16_bits
 from .preprocess import read_codes
@@ -69,6 +70,7 @@ def choose_response(
         if dataset.kind == "raw":
             matrix = color_matrix([record.image for record in dataset.records])
         return ResponseChoice(dataset, response_by_name(_CURVES[dataset.kind]), matrix)
+    dataset = replace(dataset, notes=(*dataset.notes, *_cameras_note(dataset)))
     if str(curve) == "auto":
         selection = _select_for_dataset(dataset, method, candidates)
         if selection.note:
@@ -107,6 +109,16 @@ def check_response(dataset: DataparserOutputs, response: "str | Path | Response"
     if str(response) not in allowed:
         problem = f"its photos are {dataset.kind}: their light is known, and response {response} does not apply"
         raise InputError(path, problem, "leave the response out")
+
+
+def _cameras_note(dataset: DataparserOutputs) -> list[str]:
+    """Return a note if EXIF names several cameras, each of which has a response of its own."""
+    lenses = (exif_lens(record.image) for record in dataset.records if not record.derived)
+    models = Counter(name for lens in lenses if (name := lens[1].strip(" \0") if lens else "None") != "None")
+    if len(models) < 2:
+        return []
+    names = first_names([f"{name} ({count})" for name, count in models.most_common()])
+    return [f"photos of {len(models)} cameras get one response, which fits some of them better: {names}"]
 
 
 def _with_clip_colors(dataset: DataparserOutputs, response: str) -> DataparserOutputs:

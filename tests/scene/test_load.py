@@ -16,7 +16,7 @@ from sehdr_warp.scene.dataparser import ImageRecord
 from sehdr_warp.scene.file_names import natural_key, unique_names
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
-from tests.make_scenes import load, write_blender, write_colmap, write_ply
+from tests.make_scenes import load, pattern, write_blender, write_colmap, write_ply
 
 
 def test_a_response_that_is_a_guess_is_noted(tmp_path):
@@ -28,6 +28,25 @@ def test_a_response_that_is_a_guess_is_noted(tmp_path):
     notes = load_scene(tmp_path).notes
     assert sum("is a guess: curves that explain the photos as well differ" in note for note in notes) == 1
     assert not any("is a guess" in note for note in load_scene(tmp_path, response="srgb").notes)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "told"),
+    [
+        (
+            ("NIKON D70\0\0", "PENTAX 67", "NIKON D70"),
+            ["photos of 2 cameras get one response, which fits some of them better: NIKON D70 (2), PENTAX 67 (1)"],
+        ),
+        (("NIKON D70\0\0", "NIKON D70"), []),
+    ],
+)
+def test_photos_of_several_cameras_are_told_of(tmp_path, cameras, told):
+    write_colmap(tmp_path)
+    for number, camera in enumerate(cameras):
+        path, tags = tmp_path / "images" / f"{number:03d}.png", Image.Exif()
+        tags[0x0110] = camera
+        Image.fromarray(pattern(64, 48, number)).save(path, exif=tags)
+    assert [note for note in load(tmp_path).notes if "cameras get" in note] == told
 
 
 def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
