@@ -21,6 +21,7 @@ OTHER_FOLDERS = (*MASK_FOLDERS, "hdr", "exr")  # Folders of pictures that are no
 GEOMETRY_FOLDERS = ("depth", "depths", "confidence", "normals")  # Folders of pictures that nothing reads
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 """Folders of photos, from the full size to reduced copies."""
+INPUT = "input"  # Folder of photos of 3DGS's convert.py, which writes undistorted copies to images/
 LOOKED_FOR = 20  # Images of a set by whose names their folder is found
 INVERTED_MASK = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which 0 keeps a pixel and every other value leaves it out."""

@@ -6,11 +6,19 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..subsets import counted, first_names
-from .dataparser import ImageRecord
-from .file_names import GEOMETRY_FOLDERS, IMAGE_FOLDERS, is_system_file, list_images, natural_key, without_mask_mark
+from .dataparser import UNPLACED, ImageRecord
+from .file_names import (
+    GEOMETRY_FOLDERS,
+    IMAGE_FOLDERS,
+    INPUT,
+    is_system_file,
+    list_images,
+    natural_key,
+    without_mask_mark,
+)
 from .images.heif import HEIF_SUFFIXES, heif_installed
 from .images.ldr_files import PHOTO_SUFFIXES
-from .photo_names import bases_of
+from .photo_names import bases_of, fold_name
 
 # What tools write beside photos, and nobody takes for one.
 _QUIET = {
@@ -68,6 +76,8 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
             raise InputError(folder, problem, f"give {place} to find cameras of all{or_two}")
         remedy = f"; to find cameras of all photos anew, give {place}" * few
         notes.append(f"{count} in no view: {first_names([file.name for file in photos])}{remedy}")
+    if records[0].lens is not UNPLACED:
+        notes += _photos_apart(folder, images, files_in_use)
     if broken:
         links = counted(len(broken), "link leads", "links lead")
         notes.append(f"{links} to no file: {first_names([file.name for file in broken])}")
@@ -79,6 +89,22 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
     counts = [(place, len(list_images(place, PHOTO_SUFFIXES))) for place in geometry if place.is_dir()]
     if parts := [f"{place.relative_to(folder).as_posix()} ({count})" for place, count in counts if count]:
         notes.append(f"not used, because depth and normals come from the photos alone: pictures of {', '.join(parts)}")
+    return notes
+
+
+def _photos_apart(folder: Path, images: Sequence[Path], files_in_use: Collection[Path | None]) -> list[str]:
+    """Describe photos in the folder itself and in 3DGS's `input/` of which no view is made, if all views lie elsewhere.
+
+    3DGS's convert.py leaves all photos in `input/`, and copies those that were placed to `images/`.
+    """
+    views, notes = {fold_name(image.stem) for image in images}, []
+    for place in (folder, folder / INPUT):
+        if place.is_dir() and place not in {image.parent for image in images}:
+            files = (file for file in list_images(place, PHOTO_SUFFIXES) if file not in files_in_use)
+            apart = [file.name for file in files if fold_name(file.stem) not in views]
+            if len(apart) > 1:  # A single one is a cover.
+                remedy = f"; to find cameras of all anew, give {place}" * (place != folder)
+                notes.append(f"{len(apart)} photos of {place.name} are in no view: {first_names(apart)}{remedy}")
     return notes
 
 

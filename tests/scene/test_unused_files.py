@@ -49,6 +49,19 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     assert not said(load(tmp_path / "plain"), "in no view") and not said(load(tmp_path / "plain"), "not read")
 
 
+def test_photos_that_were_not_placed_are_named_in_input_and_beside_images(tmp_path):
+    write_colmap(tmp_path, name="{:03d}.png")
+    for place, names in ((tmp_path, ["cover"]), (tmp_path / "input", ["000", "005", "100", "101"])):
+        place.mkdir(exist_ok=True)
+        for name in names:
+            Image.fromarray(pattern(64, 48)).save(place / f"{name}.JPG", format="JPEG")
+    note = f"2 photos of input are in no view: 100.JPG, 101.JPG; to find cameras of all anew, give {tmp_path / 'input'}"
+    assert said(load(tmp_path), "in no view") == [note]
+    Image.fromarray(pattern(64, 48)).save(tmp_path / "102.png")
+    beside = f"2 photos of {tmp_path.name} are in no view: 102.png, cover.JPG"
+    assert said(load(tmp_path), "in no view") == [beside, note]
+
+
 def test_pictures_of_depth_and_normals_are_named(tmp_path):
     write_colmap(tmp_path)
     for name in ("Depth", "normals", "hdr"):

@@ -17,7 +17,7 @@ from ...errors import InputError
 from ...subsets import all_names, counted, first_names
 from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto
 from ..exposure.stack import refuse_stack
-from ..file_names import GEOMETRY_FOLDERS, OTHER_FOLDERS, image_folder, is_system_file, list_images
+from ..file_names import GEOMETRY_FOLDERS, INPUT, OTHER_FOLDERS, image_folder, is_system_file, list_images
 from ..images.heif import HEIF_SUFFIXES, register_heif
 from ..images.ldr_files import PHOTO_SUFFIXES
 from ..photo_names import fold_name, photo_labels
@@ -28,7 +28,6 @@ from ..sfm.reconstruction import Reconstruction, reconstruct
 from ..unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from ..video.decode import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
 from .arkit import find_scan
-from .colmap import INPUT
 from .colmap_model import find_model
 from .photo_copies import copies_note, find_copies, is_depth_map, maps_note
 from .transforms import is_transforms

@@ -8,6 +8,7 @@ from ...files import has_file, read_lines
 from ...subsets import counted
 from ..dataparser import DataparserOutputs, ImageRecord
 from ..file_names import (
+    INPUT,
     LOOKED_FOR,
     OTHER_FOLDERS,
     distinct,
@@ -24,7 +25,6 @@ from ..photos import unusable_notes
 from ..unused_files import unread_kinds
 from .colmap_model import DISTORTED, SparseModel, find_model, other_models, read_model, usual_models
 
-INPUT = "input"  # Folder of photos of 3DGS's convert.py, which writes undistorted copies to images/
 IMAGES_REMEDY = "copy the images that COLMAP used"
 
 
