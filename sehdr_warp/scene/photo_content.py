@@ -1,16 +1,21 @@
-"""Check the codes of all photos together: that they show something, and use the bits of their files."""
+"""Check the codes of all photos together: that they show something, fill their frame, and use their files' bits."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from ..errors import InputError
+from ..subsets import every_nth
 from .color.primaries import srgb_to_linear
+from .images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, open_image
 from .types import View
 
 _MOST_BITS_UNSCALED = 14  # Of sensors, whose codes some programs store in 16 bits as they are
 _NEARLY_WHITE = 0.97  # Part of a sensor's range in which its clipped codes end
+_JUDGED, _SIDE = 8, 128  # Photos that are looked at for a circle, and the side of their thumbnails
+_BLACK, _SHOWN = 24, 40  # Codes outside and inside the circle of a fisheye lens; of one such set 2 and 111
 
 
 def require_content(views: Sequence[View], folder: Path) -> None:
@@ -48,3 +53,32 @@ def unused_bits_note(largest: int, *, linear: bool) -> list[str]:
         return []
     note = f"no code of the 16-bit photos is above {stated}: if they hold {bits} bits"
     return [f"{note}, what clips there counts as measured; multiply their codes by {2 ** (16 - bits)}"]
+
+
+def circle_note(photos: Sequence[Path]) -> list[str]:
+    """Return a note if bare photos are circles in black frames, whose lens structure from motion does not know."""
+    if any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
+        return []
+    try:
+        outside, inside = np.median([_around_circle(photo) for photo in every_nth(photos, _JUDGED)], axis=0)
+    except (InputError, *PILLOW_ERRORS):
+        return []  # The readers of these photos report what is wrong with them.
+    if outside >= _BLACK or inside < _SHOWN:
+        return []
+    note = "photos are circles in black frames, as of a fisheye lens, but their cameras are found as of a usual lens"
+    return [f"{note}: bring cameras of COLMAP's OPENCV_FISHEYE, or convert the photos to usual ones"]
+
+
+def _around_circle(photo: Path) -> tuple[float, float]:
+    """Return nearly the brightest code outside the largest circle in a photo, and nearly the darkest just inside."""
+    with open_image(photo) as image:
+        image.draft("L", (2 * _SIDE, 2 * _SIDE))
+        small = image.convert("L")
+        small.thumbnail((_SIDE, _SIDE), Image.Resampling.BOX)
+        codes = np.asarray(small)
+    if min(codes.shape) < _SIDE / 8:
+        return 255.0, 0.0
+    rows, columns = (np.arange(side) - (side - 1) / 2 for side in codes.shape)
+    radius = np.hypot(rows[:, None], columns) / (min(codes.shape) / 2)
+    ring = (radius > 0.8) & (radius < 0.92)
+    return float(np.percentile(codes[radius > 1.08], 95)), float(np.percentile(codes[ring], 20))

@@ -6,6 +6,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.photo_content import circle_note
 from tests.make_scenes import load, pattern, write_colmap
 
 
@@ -31,6 +32,17 @@ def test_codes_of_fewer_bits_in_files_of_16_are_named(tmp_path, bits, response):
         largest, factor = 2**bits - 1, 2 ** (16 - bits)
         assert note.startswith(f"no code of the 16-bit photos is above {largest}: if they hold {bits} bits")
         assert note.endswith(f"multiply their codes by {factor}")
+
+
+@pytest.mark.parametrize(("inner", "told"), [(1.0, True), (0.6, False), (2.0, False)])
+def test_circles_in_black_frames_are_told_of(tmp_path, inner, told):
+    """An object before a black backdrop is no circle to its border."""
+    radius = np.hypot(*np.meshgrid(np.linspace(-4 / 3, 4 / 3, 320), np.linspace(-1, 1, 240)))
+    photos = [tmp_path / f"{i}.jpg" for i in range(3)]
+    for i, photo in enumerate(photos):
+        codes = np.maximum(pattern(320, 240, i), 60) * (radius < inner)[..., None]
+        Image.fromarray(codes.astype(np.uint8)).save(photo)
+    assert any("circles in black frames" in note for note in circle_note(photos)) == told
 
 
 def test_photos_that_are_nearly_opaque_everywhere_show_something(tmp_path):
