@@ -114,7 +114,7 @@ def check_response(dataset: DataparserOutputs, response: "str | Path | Response"
 def _cameras_note(dataset: DataparserOutputs) -> list[str]:
     """Return a note if EXIF names several cameras, each of which has a response of its own."""
     lenses = (exif_lens(record.image) for record in dataset.records if not record.derived)
-    models = Counter(name for lens in lenses if (name := lens[1].strip(" \0") if lens else "None") != "None")
+    models = Counter(name for lens in lenses if (name := lens[1] if lens else "None") != "None")
     if len(models) < 2:
         return []
     names = first_names([f"{name} ({count})" for name, count in models.most_common()])

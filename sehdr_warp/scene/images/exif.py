@@ -91,7 +91,12 @@ def exif_lens(path: Path | None) -> tuple[str, ...]:
             values = [first.get(tag) for tag in _CAMERA] + [table.get(tag) for tag in _LENS]
     except (*PILLOW_ERRORS, InputError):
         return ()
-    return tuple(map(str, values)) if set(values) != {None} else ()
+    return exif_texts(*values) if set(values) != {None} else ()
+
+
+def exif_texts(*values: Any) -> tuple[str, ...]:
+    """Return values of EXIF as texts, without the spaces and zeros with which some cameras and tools fill them up."""
+    return tuple(str(value).strip(" \0") for value in values)
 
 
 def are_camera_jpegs(sources: Sequence[Path | None]) -> bool:

@@ -27,6 +27,7 @@ from ...parallel import preserve_signals, run_interruptibly
 from ...progress import Stage, stage, track_progress
 from ...subsets import all_names, counted
 from ..cached_folder import cached_folder, file_digest
+from ..images.exif import exif_texts
 from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from ..masks import write_reduced
 from ..photo_names import photo_labels
@@ -227,7 +228,7 @@ def _device(photo: Path) -> tuple[str, ...]:
         try:
             exif = exif_of(image)
             lens = exif.get_ifd(0x8769)
-            return str(exif.get(0x010F)), str(exif.get(0x0110)), str(lens.get(0x920A)), str(lens.get(0xA405))
+            return exif_texts(exif.get(0x010F), exif.get(0x0110), lens.get(0x920A), lens.get(0xA405))
         except PILLOW_ERRORS:
             return ("None",) * 4
 

@@ -155,6 +155,7 @@ def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
 
     one, two = exif_photo(0, "One"), exif_photo(1, "Two")
     assert lenses([None] * PHOTOS) == [0] * PHOTOS == lenses([tmp_path / "none.jpg"] * PHOTOS)
+    assert lenses([one, exif_photo(99, "One\0 \0")] * 3) == [0] * PHOTOS
     assert lenses([one, two] * 3) == [0, 1] * 3 == lenses([one, exif_photo(2, "One", aperture=8)] * 3)
     assert lenses([one, exif_photo(3, "One", focal=70)] * 3) == [0, 1] * 3
     # Structure from motion finds a focal length a little differently for each photo.

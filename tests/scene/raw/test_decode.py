@@ -271,6 +271,10 @@ def test_structure_from_motion_asks_linear_photos_for_no_exif(tmp_path):
     write_exr(tmp_path / "a.exr", rgb_channels(picture()))
     sizes, small = _write_photos([tmp_path / "a.exr"], tmp_path / "copies")
     assert _device(tmp_path / "a.exr") == ("None",) * 4
+    exif = Image.Exif()
+    for name, exif[0x0110] in (("filled", "FC3682\0\0"), ("plain", "FC3682")):
+        Image.new("RGB", (4, 4)).save(tmp_path / f"{name}.jpg", exif=exif)
+        assert _device(tmp_path / f"{name}.jpg") == ("None", "FC3682", "None", "None")
     assert (sizes, small) == ([(32, 24)], [(32, 24)])
     copy = np.asarray(Image.open(tmp_path / "copies" / "00000.png"))
     assert copy.dtype == np.uint8 and 60 < copy.mean() < 180
