@@ -34,7 +34,7 @@ from .readers.transforms import is_transforms, read_transforms
 from .response_choice import check_response, choose_response
 from .truth_files import assign_truth
 from .types import Scene
-from .unused_files import ARCHIVE_SUFFIXES, unread_cameras, unused_notes
+from .unused_files import ARCHIVE_SUFFIXES, unread_geometry, unused_notes
 from .video.decode import UNSTITCHED_SUFFIXES, is_video
 from .video.frames import read_video
 
@@ -190,7 +190,7 @@ def parse_dataset(
     training = sum(record.split == "train" for record in records)
     unused: list[str] = []
     if not is_embedded(path) and dataset.format != "video":
-        unused = [*unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]), *unread_cameras(root)]
+        unused = [*unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]), *unread_geometry(root)]
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
         raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")

@@ -108,10 +108,19 @@ def _photos_apart(folder: Path, images: Sequence[Path], files_in_use: Collection
     return notes
 
 
-def unread_cameras(root: Path) -> list[str]:
-    """Name K.txt (openMVG) and *.jpg.camera (Strecha's benchmark) in a folder and those in it: they are not read."""
-    files = [file for name in ("K.txt", "*.camera") for place in ("", "*/") for file in sorted(root.glob(place + name))]
-    return [f"files of cameras that are not read: {first_names([file.name for file in files])}"] if files else []
+def unread_geometry(root: Path) -> list[str]:
+    """Name files of a folder and of those in it that state geometry and are not read.
+
+    They are K.txt (openMVG), *.jpg.camera (Strecha's benchmark) and gcp_list.txt (OpenDroneMap).
+    """
+
+    def names(*patterns: str) -> str:
+        files = (file for name in patterns for place in ("", "*/") for file in sorted(root.glob(place + name)))
+        return first_names([file.name for file in files])
+
+    cameras, points = names("K.txt", "*.camera"), names("gcp_list.txt")
+    notes = [f"files of cameras that are not read: {cameras}"] if cameras else []
+    return [*notes, f"ground control points are not read: {points}; `view` can set scale and up"] if points else notes
 
 
 def unread_kinds(folder: Path) -> str:

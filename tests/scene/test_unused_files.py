@@ -81,6 +81,10 @@ def test_files_of_cameras_beside_photos_are_named(tmp_path):
     (tmp_path / "images" / "K.txt").write_text("64 0 32\n0 64 24\n0 0 1\n")
     note = "files of cameras that are not read: K.txt, 000.png.camera"
     assert said(load(tmp_path), "cameras that") == [note]
+    assert not said(load(tmp_path), "control points")
+    (tmp_path / "gcp_list.txt").write_text("EPSG:32633\n400 500 90 32 24 000.png\n")
+    note = "ground control points are not read: gcp_list.txt; `view` can set scale and up"
+    assert said(load(tmp_path), "control points") == [note]
 
 
 @pytest.mark.parametrize("count", [1, 2])
