@@ -24,7 +24,7 @@ from ..runs.config import Config
 from ..scene import Scene
 from .flat_gradients import FlatGradients
 from .hdr_truth import largest_hdr_truth
-from .losses import compared_image, data_loss, extra_images, opacity_loss
+from .losses import compared_image, data_loss, extra_images, opacity_loss, size_loss
 from .ranks import Ranks
 from .strategies import SEED_STRIDE, Strategy
 from .training_views import TrainingView
@@ -40,6 +40,7 @@ class StepOptions:
 
     degree: int  # SH degree
     opacity_weight: float  # Weight of the mean opacity in the loss
+    size_weight: float  # Weight of the mean angular size in the loss
     needs_means2d_grad: bool  # Whether the strategy accumulates the gradients of the projected means
 
 
@@ -128,14 +129,14 @@ class GradientStep:
         """Prepare steps of a training.
 
         The HDR truth of the scene scales the HDR loss. In a large scene the opacity penalty spares Gaussians that no
-        photo has shown yet.
+        photo has shown yet, and sizes have no penalty.
         """
         self.field, self.optimizer, self.strategy, self.ranks = field, optimizer, strategy, ranks
         self._loss, device = config.loss, field.gaussians.means.device
         self.step_counters = torch.zeros(3, dtype=torch.int64, device=device)
         self.defer_sh_gradients = device.type == "cuda"
         self._largest_truth = largest_hdr_truth(scene, config.loss) * field.base_time
-        # They would fade before a photo shows them. Elsewhere the penalty removes copies that are not needed.
+        # They would fade or shrink before a photo shows them. Elsewhere the penalties remove what is not needed.
         self._spares_unseen = large_scene
         self._dropout = Dropout(config.model.dropout, config.seed, config.schedule.iterations, device)
         self._flat_gradients: FlatGradients | None = None  # Buffer that ranks exchange
@@ -203,6 +204,8 @@ class GradientStep:
             spares_unseen = self._spares_unseen and camera.directions is None
             moments = moments_of(self.optimizer, field.gaussians.opacity_logits) if spares_unseen else {}
             loss = loss + opacity_loss(field, render, options.opacity_weight, moments.get("exp_avg_sq"))
+        if options.size_weight and not self._spares_unseen:
+            loss = loss + size_loss(field, camera, options.size_weight)
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in it.
         dropped = {"image", "transmittance", "depths"}
         if options.needs_means2d_grad:

@@ -3,10 +3,11 @@
 from torch import Tensor
 
 from ..model.radiance_field import RadianceField
-from ..model.renders import TrainRender
+from ..model.renders import CameraTensors, TrainRender
 from ..rasterizer.losses.code_residual import code_residual
 from ..rasterizer.losses.opacity_penalty import opacity_penalty
 from ..rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
+from ..rasterizer.losses.size_penalty import size_penalty
 from ..rasterizer.losses.ssim import image_distance, ssim
 from ..response import Response, ToneMapper
 from ..runs.config import LossConfig
@@ -150,3 +151,9 @@ def opacity_loss(field: RadianceField, render: TrainRender, weight: float, momen
     assert render.opacities is not None
     extents = None if moments is None else render.rendering.extents
     return opacity_penalty(render.opacities, extents, moments, weight, field.gaussians.active_count)
+
+
+def size_loss(field: RadianceField, camera: CameraTensors, weight: float) -> Tensor:
+    """Return `weight` times the mean angular size of the Gaussians, as seen from a camera."""
+    gaussians = field.gaussians
+    return size_penalty(gaussians.log_scales, gaussians.means, camera.position, weight, gaussians.active_count)

@@ -64,11 +64,11 @@ def test_paper_preset_is_the_papers():
 
 @pytest.mark.parametrize("name", preset_names())
 def test_presets_keep_the_densification_of_their_method(name):
-    """The default's mcmc goes with its opacity weight; what builds on 3DGS has neither."""
+    """The default's mcmc goes with its weights on opacities and sizes; what builds on 3DGS has none of them."""
     config = load_config(name)
-    strategy_fields = config.densification.strategy, config.loss.opacity_weight
+    strategy_fields = config.densification.strategy, config.loss.opacity_weight, config.loss.size_weight
     relocates = name in ("default", "fast", "demo", "truth")
-    assert strategy_fields == (("mcmc", 0.01) if relocates else ("adc", 0.0))
+    assert strategy_fields == (("mcmc", 0.01, 0.01) if relocates else ("adc", 0.0, 0.0))
 
 
 def test_every_field_is_documented_and_read():

@@ -190,6 +190,23 @@ def test_new_gaussians_of_a_large_scene_do_not_fade_before_a_photo_shows_them(sc
     assert after[:3].mean() < 0.9 * before[:3].mean()
 
 
+@pytest.mark.parametrize("large", [True, False])
+def test_gaussians_that_no_photo_shows_shrink_but_in_a_large_scene(scene, device, large):
+    config = quick(length=60, **{"loss.size_weight": 0.01})
+    field = make_field(scene, config, response_for_training(scene, config), device)
+    trainer = Trainer(scene, config, field, large_scene=large)
+    gaussians = trainer.field.gaussians
+    added = gaussians.rows(torch.arange(3, device=device))
+    added["means"] = added["means"] + 1e3  # Out of view of all cameras.
+    gaussians.append(added, trainer.optimizer)
+    trainer.step_runner.invalidate()
+    before = gaussians.log_scales.detach().clone()
+    for _ in range(10):
+        trainer.step()
+    shrunk = (before - gaussians.log_scales.detach())[-3:]
+    assert not shrunk.any() if large else shrunk.amin() > 0.03
+
+
 @pytest.mark.parametrize("variant", ["default", "adc"])
 def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, variant):
     config = override_config(VARIANTS[variant], {"schedule.sh_degree_interval": 2})

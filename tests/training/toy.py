@@ -105,7 +105,7 @@ def quick(preset: str = "default", length: int = 90, **options) -> Config:
 
 VARIANTS = {
     "default": quick(),
-    "adc": quick(**{"densification.strategy": "adc", "loss.opacity_weight": 0.0}),
+    "adc": quick(**{"densification.strategy": "adc", "loss.opacity_weight": 0.0, "loss.size_weight": 0.0}),
     "3dgs": quick("3dgs", **{"optimizer.harmonics_dc": 0.01}),
     "dropout": quick(**{"model.dropout": 0.5}),
     "paper": quick("paper", 130, **PAPER),
