@@ -105,7 +105,8 @@ def make_field(
     dc = make_color_model(config.model.radiance).start(colors, response)
     points, dc = (torch.tensor(values, dtype=torch.float32) for values in (points, dc))
     gaussians = Gaussians.from_points(points, dc, config.model.sh_degree)
-    _limit_sizes(gaussians, normalized.views)
+    if config.densification.strategy == "mcmc":  # Others start as 3DGS does.
+        _limit_sizes(gaussians, normalized.views)
     return assemble_field(gaussians, config, response, time, normalization).to(device)
 
 

@@ -59,6 +59,8 @@ def test_a_point_far_from_all_others_starts_as_no_veil_before_cameras(scene):
     # The others are about as far away from it as the cameras are.
     assert angles[-1].item() == pytest.approx(MAX_START_ANGLE, rel=1e-4)
     assert angles.amax() < 1.0001 * MAX_START_ANGLE and angles.amin() < 0.8 * MAX_START_ANGLE
+    as_3dgs = load_config("default", {"model.initial_density": 0.0, "densification.strategy": "adc"})
+    assert make_field(scene, as_3dgs, LINEAR, "cpu").gaussians.log_scales[-1].exp().amin() > 0.5
 
 
 @pytest.mark.parametrize("radiance, degree", [("log", 1), ("linear", 3), ("display", 1)])
