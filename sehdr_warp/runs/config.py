@@ -133,8 +133,8 @@ class LossConfig(_Table):
     them; more leaves surfaces transparent"""
     size_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
     """weight of the mean angular size of the Gaussians, as seen from the photo's camera, which shrinks those that no
-    photo supports; without it, wide ones stay as veils before new views; it is 0 from the last relocation on, and where
-    a photo shows less than a tenth of the scene"""
+    photo supports, and which can lie as veils before new views; it is 0 from the last relocation on, and where a photo
+    shows less than a tenth of the scene"""
 
     @property
     def uses_hdr(self) -> bool:

@@ -55,18 +55,18 @@ def unused_bits_note(largest: int, *, linear: bool) -> list[str]:
     return [f"{note}, what clips there counts as measured; multiply their codes by {2 ** (16 - bits)}"]
 
 
-def circle_note(photos: Sequence[Path]) -> list[str]:
+def circle_note(photos: Sequence[Path]) -> tuple[str, ...]:
     """Return a note if bare photos are circles in black frames, whose lens structure from motion does not know."""
     if any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
-        return []
+        return ()
     try:
         outside, inside = np.median([_around_circle(photo) for photo in every_nth(photos, _JUDGED)], axis=0)
     except (InputError, *PILLOW_ERRORS):
-        return []  # The readers of these photos report what is wrong with them.
+        return ()  # The readers of these photos report what is wrong with them.
     if outside >= _BLACK or inside < _SHOWN:
-        return []
+        return ()
     note = "photos are circles in black frames, as of a fisheye lens, but their cameras are found as of a usual lens"
-    return [f"{note}: bring cameras of COLMAP's OPENCV_FISHEYE, or convert the photos to usual ones"]
+    return (f"{note}: bring cameras of COLMAP's OPENCV_FISHEYE, or convert the photos to usual ones",)
 
 
 def _around_circle(photo: Path) -> tuple[float, float]:

@@ -70,7 +70,7 @@ def choose_response(
         if dataset.kind == "raw":
             matrix = color_matrix([record.image for record in dataset.records])
         return ResponseChoice(dataset, response_by_name(_CURVES[dataset.kind]), matrix)
-    dataset = replace(dataset, notes=(*dataset.notes, *_cameras_note(dataset)))
+    dataset = replace(dataset, notes=dataset.notes + _cameras_note(dataset))
     if str(curve) == "auto":
         selection = _select_for_dataset(dataset, method, candidates)
         if selection.note:
@@ -111,14 +111,14 @@ def check_response(dataset: DataparserOutputs, response: "str | Path | Response"
         raise InputError(path, problem, "leave the response out")
 
 
-def _cameras_note(dataset: DataparserOutputs) -> list[str]:
+def _cameras_note(dataset: DataparserOutputs) -> tuple[str, ...]:
     """Return a note if EXIF names several cameras, each of which has a response of its own."""
     lenses = (exif_lens(record.image) for record in dataset.records if not record.derived)
     models = Counter(name for lens in lenses if (name := lens[1] if lens else "None") != "None")
     if len(models) < 2:
-        return []
+        return ()
     names = first_names([f"{name} ({count})" for name, count in models.most_common()])
-    return [f"photos of {len(models)} cameras get one response, which fits some of them better: {names}"]
+    return (f"photos of {len(models)} cameras get one response, which fits some of them better: {names}",)
 
 
 def _with_clip_colors(dataset: DataparserOutputs, response: str) -> DataparserOutputs:

@@ -63,7 +63,7 @@ BLOCKS = {
 
 @pytest.mark.parametrize("name", BLOCKS)
 def test_plans_of_blocks(space, name):
-    """Of a run to resume, with pickled values where submitit would put its own: nobody reads them."""
+    """Resume a run with pickled values where submitit would put its own: nobody reads them."""
     (space / "precious").mkdir()
     (space / "precious" / "a.txt").write_text("mine")
     logs = space / "new" / "blocks" / "logs"

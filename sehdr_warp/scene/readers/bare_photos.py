@@ -36,7 +36,7 @@ from .transforms import is_transforms
 _log = logging.getLogger("sehdr_warp.scene")
 
 _DEEPEST = 3  # Levels of folders in which photos are looked for
-_NO_PHOTOS = (*OTHER_FOLDERS, *GEOMETRY_FOLDERS, "thumbnails")  # Folders of other pictures
+_NO_PHOTOS = {"thumbnails"}.union(OTHER_FOLDERS, GEOMETRY_FOLDERS)  # Folders of other pictures
 # Files and folders by which a program states cameras, in lower case.
 _POSE_FILES = {
     "cameras.xml": "Metashape", "bundle.out": "Bundler", "bundle.rd.out": "Bundler", "sfm_data.json": "OpenMVG",
@@ -174,7 +174,7 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
         else:
             uncertain = i in reconstruction.weak
             placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera, uncertain=uncertain))
-    notes = (*dataset.notes, *circle_note(photos), *reconstruction.notes(photos))
+    notes = dataset.notes + circle_note(photos) + reconstruction.notes(photos)
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
 
 
