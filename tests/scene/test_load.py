@@ -16,6 +16,7 @@ from sehdr_warp.scene.dataparser import ImageRecord
 from sehdr_warp.scene.file_names import natural_key, unique_names
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
+from sehdr_warp.scene.readers.bare_photos import inner_folder
 from tests.make_scenes import load, pattern, write_blender, write_colmap, write_ply
 
 
@@ -28,6 +29,14 @@ def test_a_response_that_is_a_guess_is_noted(tmp_path):
     notes = load_scene(tmp_path).notes
     assert sum("is a guess: curves that explain the photos as well differ" in note for note in notes) == 1
     assert not any("is a guess" in note for note in load_scene(tmp_path, response="srgb").notes)
+
+
+def test_folders_far_below_count_if_none_is_near(tmp_path):
+    for place in (tmp_path / "kitti/2011_09_26/drive_0001/image_02/data", tmp_path / "kitti/photos"):
+        place.mkdir(parents=True)
+        for i in range(4):
+            Image.fromarray(pattern(16, 12, i)).save(place / f"{i}.jpg")
+        assert inner_folder(tmp_path) == place
 
 
 @pytest.mark.parametrize(

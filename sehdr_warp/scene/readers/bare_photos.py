@@ -35,7 +35,7 @@ from .transforms import is_transforms
 
 _log = logging.getLogger("sehdr_warp.scene")
 
-_DEEPEST = 3  # Levels of folders in which photos are looked for
+_DEEPEST = (3, 6)  # Levels of folders in which photos are looked for: the second if the first has none
 _NO_PHOTOS = {"thumbnails"}.union(OTHER_FOLDERS, GEOMETRY_FOLDERS)  # Folders of other pictures
 # Files and folders by which a program states cameras, in lower case.
 _POSE_FILES = {
@@ -293,16 +293,20 @@ def _remedy_without_photos(folder: Path) -> str:
 
 
 def _folders_with_photos(folder: Path) -> list[str]:
-    """List folders with photos below a folder, at most _DEEPEST levels down, as paths relative to it; runs are no such.
+    """List folders with photos below a folder, as paths relative to it; runs are no such.
 
     Of a set with cameras it is the folder of the set.
     """
+    return next(filter(None, (_folders_down_to(level, folder) for level in _DEEPEST)), [])
+
+
+def _folders_down_to(deepest: int, folder: Path) -> list[str]:
     result: dict[str, None] = {}
     for root, folders, files in os.walk(folder):
         place = Path(root).relative_to(folder)
-        deepest = len(place.parts) >= _DEEPEST
         others = (name for name in folders if is_system_file(name) or name.lower() in _NO_PHOTOS)
-        folders[:] = [] if deepest or "run.json" in files else sorted({*folders} - {*others})
+        ends = len(place.parts) >= deepest or "run.json" in files
+        folders[:] = [] if ends else sorted({*folders} - {*others})
         if place.parts and list_images(folder / place, PHOTO_SUFFIXES):
             above = folder / place.parent
             has_cameras = any((above / name).is_file() for name in _CAMERA_FILES) or find_model(above) is not None
