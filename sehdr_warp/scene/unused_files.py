@@ -43,7 +43,8 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         Notes on photos that are in no view, and on files of kinds that are not read.
 
     Raises:
-        InputError: if the set states cameras of one or two photos, and more photos lie in their folder.
+        InputError: if the set states cameras of one or two photos, and more photos lie in their folder; or of fewer
+            than ten, and more than ten times as many others lie there.
     """
     images = [record.image for record in records if not record.derived]
     if not images:
@@ -70,10 +71,10 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         count = counted(len(photos), f"photo of {where} is", f"photos of {where} are")
         # Structure from motion before may have failed, if all photos lie in one folder.
         few = len(photos) > len(images) and {image.parent for image in images} == {Path(place)} != {folder}
-        if few and len(images) < 3:
+        if few and (len(images) < 3 or len(photos) > 10 * len(images) < 100):
             problem = f"states the cameras of {len(images)} of {len(images) + len(photos)} photos"
-            or_two = ", or move the others elsewhere" * (len(images) == 2)
-            raise InputError(folder, problem, f"give {place} to find cameras of all{or_two}")
+            or_these = ", or move the others elsewhere" * (len(images) > 1)
+            raise InputError(folder, problem, f"give {place} to find cameras of all{or_these}")
         remedy = f"; to find cameras of all photos anew, give {place}" * few
         notes.append(f"{count} in no view: {first_names([file.name for file in photos])}{remedy}")
     if records[0].lens is not UNPLACED:
