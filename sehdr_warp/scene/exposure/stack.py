@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ...errors import InputError
+from ...progress import track_progress
 from ..dataparser import UNPLACED, ImageRecord
 from ..file_names import list_images
 from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
@@ -63,7 +64,8 @@ def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
     if len(photos) > MOST_OF_STACK or any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
         return
     try:
-        pictures = sorted(map(_thumbnail, photos), key=np.mean)
+        tracked = track_progress("looking for an exposure stack", photos, log)  # Large PNG and TIFF files take a while.
+        pictures = sorted((_thumbnail(photo) for _, photo in tracked), key=np.mean)
     except (InputError, *PILLOW_ERRORS):
         return  # The readers of these photos report what is wrong with them.
     alike = [each for each in starmap(_likeness, pairwise(pictures)) if each is not None]
