@@ -54,20 +54,34 @@ MIN_POINTS = 100  # Fewest points for a fit
 
 @dataclass(frozen=True)
 class MatchedPoints:
-    """Points that several photos show."""
+    """Points that several photos show, and these photos."""
 
+    views: Sequence[View]  # Training views
+    others: Sequence[View]  # Views that no gain is fitted to: they get the median gain
     points: np.ndarray  # [P, 3] world coordinates
-    visible: np.ndarray  # [V, P] bool: which views, first the training views, show which points
+    visible: np.ndarray  # [V + others, P] bool: which views show which points
+    response: Response
 
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.points)
 
-    def disagreement(
-        self, views: Sequence[View], response: Response, gains: ExposureCompensation | None, *, colors: bool = False
-    ) -> float:
+    @property
+    def observations(self) -> tuple[Sequence[View], np.ndarray, np.ndarray, Response]:
+        """The first arguments of the functions of scene.exposure.compensation."""
+        return self.views, self.points, self.visible, self.response
+
+    def fit(self) -> ExposureCompensation:
+        """Return the gains by which the photos agree best."""
+        return fit_gains(self.views, self.others, self.points, self.visible, self.response)
+
+    def disagreement(self, gains: ExposureCompensation | None, *, colors: bool = False) -> float:
         """Return the median disagreement of photos at the points after a correction, stops."""
-        return disagreement(views, self.points, self.visible[: len(views)], response, gains, colors=colors)
+        return disagreement(*self.observations, gains, colors=colors)
+
+    def every_other(self, first: int) -> "MatchedPoints":
+        """Return half of the points, from number `first` on, without the other views."""
+        return replace(self, others=(), points=self.points[first::2], visible=self.visible[:, first::2])
 
 
 class Components(NamedTuple):
@@ -120,73 +134,59 @@ def estimate_compensation(
     """Match points between the photos of a scene and estimate the compensation that explains their differences."""
     times_known = scene.exposure_times_known and config.model.exposure_compensation != "always"
     views, others = scene.train_views, scene.test_views
-    cameras = [view.camera for view in others]
 
     def matcher_of(scene: Scene) -> Matcher:
         return make_matcher(scene, response, device)
 
     def match(matcher: Matcher, count: int = POINTS) -> MatchedPoints:
         matches = matcher.match(matcher.pixels(count, np.random.default_rng(0)))
-        visible = matcher.near(cameras)[:, matches.views.cpu().numpy()]
-        return MatchedPoints(matches.points.double().cpu().numpy(), visible)
-
-    def fit(matched: MatchedPoints) -> ExposureCompensation:
-        return fit_gains(views, others, matched.points, matched.visible, response)
+        visible = matcher.near([view.camera for view in others])[:, matches.views.cpu().numpy()]
+        return MatchedPoints(views, others, matches.points.double().cpu().numpy(), visible, response)
 
     def no_drift(matcher: Matcher, matched: MatchedPoints, gains=None) -> CompensationEstimate:
-        note = _reach_note(views, matched, response)
-        return CompensationEstimate(None, _no_drift_decision(matched, gains, times_known, note), matcher)
+        return CompensationEstimate(None, _no_drift_decision(matched, gains, times_known), matcher)
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=at_matching_size(views))
     matcher = matcher_of(small)
-    if times_known and not _may_drift(views, rough := match(matcher, ROUGH_POINTS), response):
+    if times_known and not _may_drift(rough := match(matcher, ROUGH_POINTS)):
         return no_drift(matcher, rough)
     matched, guess = match(matcher), initial_gains(small.views, response)
     if not times_known and len(matched) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
         matched = max(matched, match(matcher_of(guess.normalize_photos(small, response))), key=len)
     if len(matched) < MIN_POINTS:
         return no_drift(matcher, matched)
-    compensation = fit(matched)
-    components = _explanatory_components(compensation, views, matched, response, times_known)
+    compensation = matched.fit()
+    components = _explanatory_components(compensation, matched, times_known)
     if not any(components):
         return no_drift(matcher, matched, None if times_known else compensation)
     # Match again in photos that are already similar: more points are found.
     matcher = matcher_of(compensation.parts(**components._asdict()).normalize_photos(small, response))
     matched = match(matcher)
-    compensation = fit(matched).parts(**components._asdict())
-    note = _reach_note(views, matched, response)
-    if times_known:
-        note = _changed_light(compensation, views) + note
-    decision = _decision(compensation, components, times_known, note)
-    return CompensationEstimate(compensation, decision, None)
+    compensation = matched.fit().parts(**components._asdict())
+    return CompensationEstimate(compensation, _decision(compensation, components, matched, times_known), None)
 
 
-def _may_drift(views: Sequence[View], matched: MatchedPoints, response: Response) -> bool:
+def _may_drift(matched: MatchedPoints) -> bool:
     """Return whether photos with stated times may drift, by a rough fit to few points."""
-    rough = rough_gains(views, matched.points, matched.visible, response)
-    if _exceeds_stated(rough, views):
+    rough = rough_gains(*matched.observations)
+    if _exceeds_stated(rough, matched.views):
         return True
-    remaining = remaining_vignetting(views, matched.points, matched.visible, response, rough)
-    return rough.corner_loss >= MIN_CORNER_LOSS and remaining < 1
+    return rough.corner_loss >= MIN_CORNER_LOSS and remaining_vignetting(*matched.observations, rough) < 1
 
 
 def _explanatory_components(
-    compensation: ExposureCompensation,
-    views: Sequence[View],
-    matched: MatchedPoints,
-    response: Response,
-    times_known: bool,
+    compensation: ExposureCompensation, matched: MatchedPoints, times_known: bool
 ) -> Components:
     """Return the components of a compensation to apply: large ones that explain how photos differ at shared points.
 
     Exposure that photos state is corrected only by what explains other points than those of its fit, too.
     """
-    before = matched.disagreement(views, response, None)
-    after = matched.disagreement(views, response, compensation.parts(vignetting=False))
+    views, before = matched.views, matched.disagreement(None)
+    after = matched.disagreement(compensation.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
     exposure = white_balance = not times_known and compensation.stops >= MIN_STOPS and explains
-    validate = cache(lambda: _cross_validate(views, matched, response))
+    validate = cache(lambda: _cross_validate(matched))
     if not exposure and (
         compensation.white_balance >= MIN_WHITE_BALANCE or (times_known and _exceeds_stated(compensation, views))
     ):
@@ -218,30 +218,22 @@ class Remaining(NamedTuple):
     vignetting: float  # See remaining_vignetting()
 
 
-def _cross_validate(views: Sequence[View], matched: MatchedPoints, response: Response) -> Remaining:
+def _cross_validate(matched: MatchedPoints) -> Remaining:
     """Return what gains that are fitted to half of the points leave at the other half; the mean of both ways."""
-    halves, remaining = (slice(0, None, 2), slice(1, None, 2)), []
-    for fitted, evaluated in (halves, halves[::-1]):
-        rest = MatchedPoints(matched.points[evaluated], matched.visible[:, evaluated])
-        visible = matched.visible[: len(views), fitted]
-        fit = fit_gains(views, (), matched.points[fitted], visible, response)
+    halves, remaining = [matched.every_other(first) for first in (0, 1)], []
+    for fitted, rest in (halves, halves[::-1]):
+        fit = fitted.fit()
         drift = fit.parts(vignetting=False)
-        exposure = (
-            rest.disagreement(views, response, drift),
-            rest.disagreement(views, response, drift.explained_part(views)),
-        )
-        colors = (
-            rest.disagreement(views, response, drift.parts(exposure=False), colors=True),
-            rest.disagreement(views, response, None, colors=True),
-        )
-        vignetting = remaining_vignetting(views, rest.points, rest.visible[: len(views)], response, fit)
+        exposure = rest.disagreement(drift), rest.disagreement(drift.explained_part(matched.views))
+        colors = rest.disagreement(drift.parts(exposure=False), colors=True), rest.disagreement(None, colors=True)
+        vignetting = remaining_vignetting(*rest.observations, fit)
         remaining.append([*(after / before if before else 1.0 for after, before in (exposure, colors)), vignetting])
     return Remaining(*np.mean(remaining, 0).tolist())
 
 
-def _reach_note(views: Sequence[View], matched: MatchedPoints, response: Response) -> str:
+def _reach_note(matched: MatchedPoints) -> str:
     """Return the end of the plan's line about photos whose vignetting is left out; empty if there are none."""
-    count, reach = unmeasured_reach(views, matched.points, matched.visible, response)
+    count, reach = unmeasured_reach(*matched.observations)
     if not count:
         return ""
     return f"; vignetting of {count} photos is left out: their points reach {reach:.0%} of the way to the corners"
@@ -264,8 +256,10 @@ def _changed_light(compensation: ExposureCompensation, views: Sequence[View]) ->
     )
 
 
-def _decision(compensation: ExposureCompensation, components: Components, times_known: bool, note: str) -> Decision:
-    """Return the line of the plan for gains that are corrected, which ends with a note."""
+def _decision(
+    compensation: ExposureCompensation, components: Components, matched: MatchedPoints, times_known: bool
+) -> Decision:
+    """Return the line of the plan for gains that are corrected."""
     figures = []
     if components.exposure:
         figures.append(f"{compensation.stops:.2f} stops between photos")
@@ -275,20 +269,19 @@ def _decision(compensation: ExposureCompensation, components: Components, times_
         figures.append(f"{compensation.corner_loss:.0%} towards the corners")
     over = ", over the times they state" if components.exposure else ", exposures stay as stated"
     choice = f"taken out of the photos{over if times_known else ''}"
-    reason = f"matched points differ by {', '.join(figures)}{note}"
+    changed = _changed_light(compensation, matched.views) if times_known else ""
+    reason = f"matched points differ by {', '.join(figures)}{changed}{_reach_note(matched)}"
     return Decision({}, choice, reason, COMPENSATION, always_log=True)
 
 
-def _no_drift_decision(
-    matched: MatchedPoints, gains: ExposureCompensation | None, times_known: bool, note: str
-) -> Decision:
+def _no_drift_decision(matched: MatchedPoints, gains: ExposureCompensation | None, times_known: bool) -> Decision:
     """Return the line of the plan for photos that stay as they are, with the gains that do not explain them, if any."""
     choice, least = "none", f"{MIN_STOPS} stops between photos, or {MIN_CORNER_LOSS:.0%} towards the corners"
     reason = "do not contradict the stated times" if times_known else f"differ by less than {least}"
     if gains is not None and (gains.stops >= MIN_STOPS or gains.corner_loss >= MIN_CORNER_LOSS):
         figures = f"{gains.stops:.2f} stops between photos and {gains.corner_loss:.0%} towards the corners"
         reason = f"differ by {figures}, and correcting that does not make them alike"
-    reason = f"matched points {reason}{note}"
+    reason = f"matched points {reason}{_reach_note(matched)}"
     if len(matched) < MIN_POINTS:
         choice, reason = UNMEASURED, f"{len(matched)} points match between the photos, too few to measure it"
     elif gains is not None and np.ptp(np.log2(list(gains.gains.values()))[:, 1]) >= DRIFT:
