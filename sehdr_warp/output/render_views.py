@@ -17,7 +17,7 @@ from .brackets import BracketWriter, bracket_exposures, remove_earlier
 from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .cameras.selection import check_cameras, may_move, read_size, select_cameras
 from .images.colorspace import from_rec709
-from .images.display import exposure_for_white
+from .images.display import display_gain, exposure_for_white
 from .images.exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
 from .images.ldr_files import quantize, write_picture
 from .images.ocio import ocio_view
@@ -229,7 +229,8 @@ def shared_tone_map(run: "RenderableScene", cameras: Sequence[Camera]) -> ToneMa
     """Return one tone map for all pictures of some cameras, fitted to a few small renders."""
     small = [camera.within(_FIT_SIZE) for camera in evenly(cameras, _FIT_VIEWS)]
     renders = [run.render(camera, supersample=False) for camera in small]
-    return fit_tone_map([each.hdr.cpu().numpy() for each in renders], [each.alpha.cpu().numpy() for each in renders])
+    pictures, alphas = zip(*((each.hdr.cpu().numpy(), each.alpha.cpu().numpy()) for each in renders), strict=True)
+    return fit_tone_map(pictures, alphas, run.base_time * display_gain(run.response))
 
 
 def _hdr_parts(

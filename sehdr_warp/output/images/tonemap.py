@@ -16,6 +16,8 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # ITU-R BT.709 luminance weights
 _FLOOR = 1e-6  # Below this part of the brightest per cent, a pixel says nothing about the scene's key
 # Reinhard 2003 uses the extremes; percentiles keep a lamp's filament from deciding the picture.
 _LOW, _HIGH, _WHITE = 1.0, 99.0, 99.8
+# Most that pictures are brighter than photos: sound captures have half to 1.6 times, those with much black up to 2^8.
+_BRIGHTEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -38,15 +40,22 @@ class ToneMap:
         return value * (1 + value / np.float32(self.white**2)) / (1 + value)
 
 
-def fit_tone_map(pictures: Sequence[np.ndarray], alphas: Sequence[np.ndarray | None] = ()) -> ToneMap:
+def fit_tone_map(
+    pictures: Sequence[np.ndarray], alphas: Sequence[np.ndarray | None] = (), gain: float = np.inf
+) -> ToneMap:
     """Return one tone map for pictures of a scene.
 
-    Black scenes get the identity. Raises ValueError without pictures.
+    A dark ground around a bright subject would brighten the subject to white. So pictures get at most one stop
+    brighter than photos, or than photos whose brightest per cent is white. Black scenes get the identity.
 
     Args:
         pictures: [H, W, 3] linear Rec.709 radiance each.
         alphas: [H, W] coverage of each, or None. Where at least half of a pixel is empty, as around an object that was
             cut out, it says nothing about the scene's key.
+        gain: factor from radiance to display light at the exposure of the photos; without it nothing limits the scale.
+
+    Raises:
+        ValueError: without pictures.
     """
     parts = []
     for picture, alpha in zip(pictures, alphas or [None] * len(pictures), strict=True):
@@ -58,11 +67,11 @@ def fit_tone_map(pictures: Sequence[np.ndarray], alphas: Sequence[np.ndarray | N
     values = values[np.isfinite(values) & (values > 0)]  # Writers refuse what is not finite, and say where.
     if not values.size:
         return ToneMap(1.0, 1.0)
-    values = values[values > np.percentile(values, _HIGH) * _FLOOR]
+    values = values[values > (bright := np.percentile(values, _HIGH)) * _FLOOR]
     logs = np.log2(values)
     (low, high), average = np.percentile(logs, (_LOW, _HIGH)), logs.mean()
     # Between 0.09 for a mostly dark scene with highlights and 0.36 for a bright one.
     key = MIDDLE_GREY * 2.0 ** np.clip((2 * average - low - high) / max(high - low, 1e-6), -1, 1)
-    scale = key / 2.0**average
+    scale = min(key / 2.0**average, _BRIGHTEST * max(gain, 1 / bright))
     # A white below 1 would make the curve convex, and brighten everything.
     return ToneMap(float(scale), float(max(np.percentile(values, _WHITE) * scale, 1.0)))

@@ -324,7 +324,8 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> Markup:
 
 
 def _map(run: "Run", comparisons: Sequence[Comparison]) -> Markup:
-    tone_map = fit_tone_map([each.hdr for each in comparisons], [each.alpha for each in comparisons])
+    gain = float(np.median([each.scale for each in comparisons]))
+    tone_map = fit_tone_map([each.hdr for each in comparisons], [each.alpha for each in comparisons], gain)
     lead = markup(
         'From above, as the photos see it. <span style="color: var(--accent)">Amber</span>: trained on. '
         '<span style="color: var(--cool)">Blue</span>: held out.'

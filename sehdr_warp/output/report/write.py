@@ -121,7 +121,8 @@ def comparison_figure(comparisons: Sequence[Comparison], caption: str, *, held_o
             columns[f"{name} at {stops_text(darker)}"] = [expose(r, darker, scale=scale) for r, scale in lights]
     new = [c.new for c in comparisons if c.new is not None]
     if len(new) == len(comparisons):
-        columns["New view, tone-mapped"] = list(map(fit_tone_map(new, [c.new_alpha for c in comparisons]), new))
+        gain = float(np.median([each.scale for each in comparisons]))
+        columns["New view, tone-mapped"] = list(map(fit_tone_map(new, [c.new_alpha for c in comparisons], gain), new))
     rows = list(zip(*columns.values(), strict=True))
     return _grid(rows, list(columns), [c.name for c in comparisons], caption, cell=2.6)
 

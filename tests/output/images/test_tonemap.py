@@ -1,7 +1,8 @@
 import numpy as np
+import pytest
 
 from sehdr_warp.output.images.display import encode_srgb, expose
-from sehdr_warp.output.images.tonemap import ToneMap, fit_tone_map
+from sehdr_warp.output.images.tonemap import LUMINANCE, ToneMap, fit_tone_map
 
 from ..helpers import radiance
 
@@ -29,6 +30,18 @@ def test_the_empty_ground_of_a_cut_out_object_does_not_count():
     assert fit_tone_map([picture], [alpha]) == fit_tone_map([object_alone])
     assert fit_tone_map([picture]).scale > 10 * fit_tone_map([object_alone]).scale
     assert fit_tone_map([picture], [0.1 * alpha]) == fit_tone_map([picture])  # Nothing is more than half covered.
+
+
+def test_a_black_ground_does_not_make_the_subject_white():
+    """A subject before opaque black, as of photos on velvet, is shown one stop brighter than its photos at most."""
+    subject = radiance(64, 64)
+    picture, alpha = np.full((64, 320, 3), 1e-3, np.float32), np.ones((64, 320))
+    picture[:, :64] = subject
+    gain = fit_tone_map([subject]).scale
+    assert fit_tone_map([picture], [alpha]).scale > 10 * gain
+    assert fit_tone_map([picture], [alpha], gain).scale == 2 * gain
+    dark = fit_tone_map([picture * 1e-3], [alpha], gain).scale  # Of photos that are too dark, whites may be white.
+    assert dark == pytest.approx(2e3 / np.percentile(picture @ LUMINANCE, 99))
 
 
 def test_tone_map_uses_the_display():
