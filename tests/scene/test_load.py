@@ -16,7 +16,7 @@ from sehdr_warp.scene.dataparser import ImageRecord
 from sehdr_warp.scene.file_names import natural_key, unique_names
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import _held_out
-from sehdr_warp.scene.readers.bare_photos import inner_folder
+from sehdr_warp.scene.readers.bare_photos import find_photos, inner_folder
 from tests.make_scenes import load, pattern, write_blender, write_colmap, write_ply
 
 
@@ -37,6 +37,28 @@ def test_folders_far_below_count_if_none_is_near(tmp_path):
         for i in range(4):
             Image.fromarray(pattern(16, 12, i)).save(place / f"{i}.jpg")
         assert inner_folder(tmp_path) == place
+
+
+def test_a_folder_of_a_set_beside_the_photos_is_named(tmp_path):
+    write_blender(tmp_path / "nerfstudio_data", 4)
+    for place in (tmp_path / "images", tmp_path / "images_2"):
+        place.mkdir()
+        for i in range(4):
+            Image.fromarray(pattern(16, 12, i)).save(place / f"{i}.jpg")
+    assert find_photos(tmp_path).notes == ("photos in folders of it are not read: nerfstudio_data",)
+
+
+def test_pictures_of_depth_and_normals_beside_photos_of_their_names_are_not_photos(tmp_path):
+    """They may be colored."""
+    kinds = ("{}_rgb.png", "{}_normal.png", "{}_depth.png")
+    for seed, (kind, i) in enumerate((kind, i) for kind in kinds for i in range(4)):
+        Image.fromarray(pattern(16, 12, seed)).save(tmp_path / kind.format(i))
+    dataset = find_photos(tmp_path)
+    assert [record.view for record in dataset.records] == [f"{i}_rgb" for i in range(4)]
+    (note,) = dataset.notes
+    assert note.startswith("8 pictures called depth, confidence or normals are left out: 0_depth.png, 0_normal.png")
+    Image.fromarray(pattern(16, 12, 20)).save(tmp_path / "normal_lens.png")
+    assert find_photos(tmp_path).records[-1].view == "normal_lens"
 
 
 @pytest.mark.parametrize(

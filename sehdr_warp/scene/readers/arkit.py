@@ -18,7 +18,7 @@ from ..file_names import find_image, list_images, natural_key
 from ..images.ldr_files import LDR_SUFFIXES, PHOTO_SUFFIXES
 from ..lens import Lens
 from ..photos import FEWEST_PHOTOS, photo_sizes, unusable_notes
-from .photo_copies import is_depth_map, maps_note
+from .photo_copies import find_maps, maps_note
 from .transforms import absent_note, pose_from_opengl
 
 _PLACES = tuple(
@@ -63,7 +63,7 @@ def read_scan(folder: Path) -> DataparserOutputs:
             records.append(_record(image, file))
         except InputError as error:
             unusable.append(error)
-    maps = [picture for picture in list_images(photos, LDR_SUFFIXES) if is_depth_map(picture)]
+    maps = find_maps(list_images(photos, LDR_SUFFIXES))
     notes = [*unusable_notes(unusable, len(records) + len(unusable)), *absent_note(absent, len(records))]
     notes += [
         *maps_note(maps),

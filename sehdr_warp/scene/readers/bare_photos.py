@@ -17,7 +17,15 @@ from ...errors import InputError
 from ...subsets import all_names, counted, first_names
 from ..dataparser import UNPLACED, DataparserOutputs, ImageRecord, PlacedPhoto
 from ..exposure.stack import refuse_stack
-from ..file_names import GEOMETRY_FOLDERS, INPUT, OTHER_FOLDERS, image_folder, is_system_file, list_images
+from ..file_names import (
+    GEOMETRY_FOLDERS,
+    IMAGE_FOLDERS,
+    INPUT,
+    OTHER_FOLDERS,
+    image_folder,
+    is_system_file,
+    list_images,
+)
 from ..images.heif import HEIF_SUFFIXES, register_heif
 from ..images.ldr_files import PHOTO_SUFFIXES
 from ..photo_content import circle_note
@@ -30,7 +38,7 @@ from ..unused_files import ARCHIVE_SUFFIXES, unread_kinds
 from ..video.decode import UNSTITCHED_REMEDY, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES
 from .arkit import find_scan
 from .colmap_model import find_model
-from .photo_copies import copies_note, find_copies, is_depth_map, maps_note
+from .photo_copies import copies_note, find_copies, find_maps, maps_note
 from .transforms import is_transforms
 
 _log = logging.getLogger("sehdr_warp.scene")
@@ -73,7 +81,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
     """
     places = (place for place in (folder, folder / "images", folder / INPUT) if place.is_dir())
     listed = [list_images(place, PHOTO_SUFFIXES) for place in places]
-    maps = {picture for pictures in listed for picture in pictures if is_depth_map(picture)}
+    maps = set(itertools.chain(*map(find_maps, listed)))
     # Pictures without others beside them are grey photos with such a word in their names.
     candidates = [[picture for picture in pictures if picture not in maps] or pictures for pictures in listed]
     photos = max(candidates, key=len)  # Fewer pictures beside `images/` are a cover, or pictures of results.
@@ -108,7 +116,8 @@ def find_photos(folder: Path) -> DataparserOutputs:
         if len(others) > 1 and others[0].parent != photos[0].parent:
             count, names = f"{len(others)} photos of {others[0].parent.name}", first_names([p.name for p in others])
             notes.append(f"{count} are not read, because there are more in {photos[0].parent.name}: {names}")
-    if photos[0].parent == folder and (inner := _folders_with_photos(folder)):
+    named = {photo.parent for photo in itertools.chain(photos, *candidates)}.union(folder / e for e in IMAGE_FOLDERS)
+    if inner := [each for each in _folders_with_photos(folder) if folder / each not in named]:
         notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
     stems = Counter(fold_name(photo.stem) for photo in photos) if together else {}
     views = [f"{photo.parent.name}_" * (stems.get(fold_name(photo.stem), 1) > 1) + photo.stem for photo in photos]

@@ -20,7 +20,8 @@ _ALIKE = 0.97  # Correlation of two thumbnails of one picture; photos from two p
 _SIDE = 32  # Of a thumbnail
 _SAMPLE = 4096  # Bytes from the middle of files, which are compared before their digests
 _EDITED = re.compile(r"(?<=^img_)e(?=\d)|-edited$")  # What iOS and Google Photos put into the names of edited photos
-_MAP = re.compile(r"(^|[^a-z])(depths?|conf|confidence|disparity)($|[^a-z])")  # conf_00001 of the 3D Scanner App
+_MAP = re.compile(r"(?<![a-z])(depths?|conf|confidence|disparity|normals?)(?![a-z])")  # conf_00001, 000_normal
+_OF_PHOTOS = re.compile(r"(?<![a-z])(rgb|colou?r|image|img|frame)(?![a-z])")  # 000_rgb beside 000_normal
 _KINDS = (*HEIF_SUFFIXES, ".tif", ".tiff", ".png", ".avif", ".webp", *JPEG_SUFFIXES, ".bmp")
 """Kinds of files by preference: of two files of one picture the first kind counts, which may hold more bits."""
 
@@ -91,9 +92,24 @@ def _sample(photo: Path) -> bytes:
     return size.to_bytes(8) + part
 
 
-def is_depth_map(picture: Path) -> bool:
-    """Return whether a picture is called depth or confidence, as apps of phones write it beside photos, and is grey."""
-    if not _MAP.search(picture.stem.lower()) or picture.suffix.lower() not in LDR_SUFFIXES:
+def find_maps(pictures: Sequence[Path]) -> list[Path]:
+    """Return the pictures that are called depth, confidence or normals, and are none of photos.
+
+    They are grey, as apps of phones write depth and confidence, or have the name of a photo but for this word.
+    """
+    words = {picture: word[0] for picture in pictures if (word := _MAP.search(picture.stem.lower()))}
+    photos = {_name_without_kind(picture) for picture in pictures if picture not in words}
+    grey = (picture for picture, word in words.items() if not word.startswith("normal") and _is_grey(picture))
+    maps = {*grey, *(picture for picture in words if _name_without_kind(picture) in photos)}
+    return [picture for picture in words if picture in maps]
+
+
+def _name_without_kind(picture: Path) -> str:
+    return re.sub(r"[\W_]+", " ", _OF_PHOTOS.sub("", _MAP.sub("", picture.stem.lower()))).strip()
+
+
+def _is_grey(picture: Path) -> bool:
+    if picture.suffix.lower() not in LDR_SUFFIXES:
         return False
     try:
         with open_image(picture) as image:
@@ -103,11 +119,10 @@ def is_depth_map(picture: Path) -> bool:
 
 
 def maps_note(maps: Sequence[Path]) -> list[str]:
-    """Return a note on depth maps that are left out; none if there are none."""
-    if not maps:
-        return []
-    count = counted(len(maps), "picture that is grey and called {} is", "pictures that are grey and called {} are")
-    return [f"{count.format('depth or confidence')} left out: {first_names([each.name for each in maps])}"]
+    """Return a note on depth maps and the like that are left out; none if there are none."""
+    count = counted(len(maps), "picture called {} is", "pictures called {} are")
+    names = first_names([each.name for each in maps])
+    return [f"{count.format('depth, confidence or normals')} left out: {names}"] if maps else []
 
 
 def _equal_files(photos: Sequence[Path]) -> tuple[dict[Path, Path], list[Path]]:

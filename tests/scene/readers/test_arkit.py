@@ -48,7 +48,7 @@ def test_poses_and_lenses_of_apps(tmp_path, app):
     for record, pose in zip(dataset.records, poses, strict=True):
         np.testing.assert_allclose(record.world_to_camera, pose, atol=1e-9)
         assert record.lens.params == LENS and (record.lens.width, record.lens.height) == (64, 48)
-    assert any(note.startswith("6 pictures that are grey") for note in dataset.notes) == (app == "scanner")
+    assert any(note.startswith("6 pictures called depth") for note in dataset.notes) == (app == "scanner")
     assert not any("in no view" in note for note in dataset.notes)
 
 

@@ -150,7 +150,7 @@ def test_depth_and_confidence_beside_photos_are_not_photos(tmp_path):
         Image.fromarray(pattern(8, 6, i)[..., 0]).save(tmp_path / f"frame-{i}.confidence.png")
     dataset = find_photos(tmp_path)
     assert [record.view for record in dataset.records] == [*(f"IMG_{i}" for i in range(4)), "depth_of_field"]
-    note = "18 pictures that are grey and called depth or confidence are left out: depth_0.png, depth_1.png,"
+    note = "18 pictures called depth, confidence or normals are left out: depth_0.png, depth_1.png,"
     assert any(each.startswith(note) for each in dataset.notes)
     assert unused_notes(tmp_path, dataset.records, dataset.mentioned) == []
 
