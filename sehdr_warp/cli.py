@@ -1,5 +1,7 @@
 """The command `sehdr-warp`: find the command, parse its options, call it, and print errors as one line.
 
+A call: main() -> run_program() -> _run(), which sets the process up -> parse_command() -> the command's function.
+
 Each command is a dataclass of options and a function that takes them, in the `commands` module of its package. To add
 one, add a line to COMMANDS. A module is imported when its command runs, so nothing here imports torch.
 """

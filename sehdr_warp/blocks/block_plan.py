@@ -22,7 +22,7 @@ from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_from_dict, field_and_problem, override_config
 from ..runs.open import in_world_of_run, load_scene_and_log_notes, response_for_loading
-from ..runs.scene_description import FOUND
+from ..runs.scene_description import SFM_LAYOUTS
 from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationValues
 from ..scene import Camera, Scene, View
 from ..scene.exposure.compensation import ExposureCompensation
@@ -245,7 +245,7 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
         shared,
         times,
         _photo_bytes(scene.views),
-        {view.name: view.camera for view in scene.views} if scene.format in FOUND else {},
+        {view.name: view.camera for view in scene.views} if scene.format in SFM_LAYOUTS else {},
         config,
         division.axes,
         _blocks(scene, division, points),

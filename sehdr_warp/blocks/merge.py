@@ -18,7 +18,7 @@ from torch import Tensor
 from ..errors import InputError
 from ..model.confidence import Evidence
 from ..model.gaussians import PARAMETER_NAMES
-from ..runs.checkpoint import PICTURE, Checkpoint
+from ..runs.checkpoint import RENDER_TENSORS, Checkpoint
 from ..runs.config_files import override_config
 from ..runs.run_folder import RunFolder
 from ..runs.run_writer import RunWriter, write_confidence
@@ -107,7 +107,7 @@ def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:
     """Read what the merged run takes from a block."""
     folder = RunFolder(folder_of(out, plan, index))
     folder.require()
-    checkpoint = folder.newest_checkpoint(PICTURE)
+    checkpoint = folder.newest_checkpoint(RENDER_TENSORS)
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "continue with --resume")
     info = folder.read_info()

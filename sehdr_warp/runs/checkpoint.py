@@ -13,7 +13,7 @@ from ..files import UnreadableError, plain_size, read_bytes, refuse_links
 from .values import CheckpointValues, read_values
 
 TENSORS, VALUES = "state.safetensors", "checkpoint.json"
-PICTURE = "gaussians.", "fusion.", "response."
+RENDER_TENSORS = "gaussians.", "fusion.", "response."
 """Beginnings of the names of the tensors that decide the picture; the others continue a training."""
 _LARGE = 1 << 28  # Bytes that are hashed in no time
 _OLDER = "remove this folder to use an older checkpoint, or train again"
@@ -100,6 +100,6 @@ def first_not_finite(tensors: dict[str, Tensor]) -> str | None:
     return next((name for name, tensor in floats if not bool(tensor.isfinite().all())), None)
 
 
-def under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def part_of(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Return the tensors whose names begin with a prefix, under their names without it."""
     return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

@@ -9,7 +9,7 @@ from ..model.gaussians import PARAMETER_NAMES, Gaussians
 from ..model.radiance_field import RadianceField
 from ..response import Response
 from ..scene.normalization import Normalization
-from .checkpoint import Checkpoint, under
+from .checkpoint import Checkpoint, part_of
 from .config import Config
 
 
@@ -23,7 +23,7 @@ def field_from_checkpoint(checkpoint: Checkpoint, config: Config, info: dict) ->
         learned = field.response if isinstance(field.response, torch.nn.Module) else None
         for name, part in (("fusion.", field.fusion), ("response.", learned)):
             if part is not None:
-                part.load_state_dict(under(checkpoint.tensors, name))
+                part.load_state_dict(part_of(checkpoint.tensors, name))
     except (KeyError, ValueError, RuntimeError) as error:
         problem = f"its tensors do not fit the config ({error})"
         raise InputError(checkpoint.path, problem, "the run is damaged: train again") from None

@@ -79,10 +79,10 @@ def load_scene_and_log_notes(data: LoadArguments, **options: Any) -> Scene:
 
 @dataclass(frozen=True)
 class PhotoRequest:
-    """Photos that a training reads, on each of its nodes."""
+    """Photos that a training reads, on each of its nodes: all arguments of load_scene()."""
 
-    data: LoadArguments  # Arguments of load_scene() as a run saves them
-    options: dict[str, Any]  # Further arguments of load_scene(): response, method, candidates, cameras, photo_storage
+    data: LoadArguments  # Those of the command line, as run.json holds them
+    options: dict[str, Any]  # Those of the config, see Config.load_options; or of a run: its response and cameras
     cameras: tuple[CameraEntry, ...] = ()  # Of the run that is resumed, if its splits count
 
     def of_run(self, config: Config, response: Response, cameras: tuple[CameraEntry, ...]) -> PhotoRequest:

@@ -23,7 +23,7 @@ from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.gravity import UpDirection
 from ..splats import cameras_beside, read_gaussians
-from .checkpoint import PICTURE
+from .checkpoint import RENDER_TENSORS
 from .config import Config
 from .device import pick_device
 from .field import field_from_checkpoint
@@ -299,7 +299,7 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     folder = RunFolder(path)
     folder.require()
     info, config = folder.read_info(), folder.read_config()
-    checkpoint = folder.newest_checkpoint(PICTURE)
+    checkpoint = folder.newest_checkpoint(RENDER_TENSORS)
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
     field, clipped = field_from_checkpoint(checkpoint, config, info).requires_grad_(False), None

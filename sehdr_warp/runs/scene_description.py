@@ -18,7 +18,7 @@ from .values import FORMAT
 
 GRID = 8
 _MOST_ROWS = 32  # Rows that are read of each row of cells; more would take longer for large photos and find little more
-FOUND = "photos", "video"  # Layouts of sets whose cameras structure from motion finds
+SFM_LAYOUTS = "photos", "video"  # Layouts of sets whose cameras structure from motion finds
 _TOLERANCE = 2  # Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded
 
 
@@ -32,7 +32,7 @@ def describe_scene(scene: Scene) -> dict:
             "has_hdr": view.hdr is not None,
             "photo": photo_signature(view.codes, view.mask),
         }
-        | (_lens_values(view, label) if scene.format in FOUND else {})
+        | (_lens_values(view, label) if scene.format in SFM_LAYOUTS else {})
         for view, label in zip(scene.views, photo_labels(sources), strict=True)
     ]
     facts = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
@@ -63,7 +63,7 @@ def scene_difference(saved: dict, current: dict) -> SceneDifference | None:
     photos, current_photos = _split_photos(saved), _split_photos(current)
     if saved.get("layout") != current["layout"]:
         return SceneDifference("layout", False)
-    if current["layout"] in FOUND:
+    if current["layout"] in SFM_LAYOUTS:
         for view in (*saved["views"], *current["views"]):
             for name in ("fx", "fy", "cx", "cy"):
                 view["camera"].pop(name, None)

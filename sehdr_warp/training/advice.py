@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ..runs.config_files import config_fields
 from ..runs.config_flags import field_text
 from ..runs.run import Run
-from ..runs.scene_description import FOUND
+from ..runs.scene_description import SFM_LAYOUTS
 from ..runs.values import SCENE_OPTIONS, LoadArguments
 from ..scene.pose_conventions import MISFIT
 from ..subsets import first_names
@@ -58,7 +58,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
     place = data.get("path") or "SCENE"
     folders = {str(view.source.parent) for view in scene.views if view.source is not None}
     posed = None
-    if folders and scene.format not in FOUND:
+    if folders and scene.format not in SFM_LAYOUTS:
         posed = folders.pop() if len(folders) == 1 else place  # No folder holds the photos of several alone.
     return advice(
         run.path,

@@ -98,13 +98,13 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
     """Train, or print the plan, and print what was written and what to do next.
 
     With --plan-only, _print_plan() is all. With --blocks, _train_blocks() starts processes of its own. With --gpus,
-    launch() starts a process for each GPU: it runs `argv`, the words of the command line, again and enters this
+    launch_ranks() starts a process for each GPU: it runs `argv`, the words of the command line, again and enters this
     function as a rank, as under torchrun. A rank goes to _train_on_rank(), a single process to _train().
     """
     _check_options(args)
-    from .launch import device_of_rank, launch, rank_from_environment
+    from .launch import device_of_rank, launch_ranks, rank_from_environment
 
-    gpus, rank_info, uses_blocks = args.machine.gpus, rank_from_environment(), _check_blocks(args)
+    gpus, rank_info, uses_blocks = args.machine.gpus, rank_from_environment(), _uses_blocks(args)
     if args.training.plan_only:
         if rank_info is None or rank_info.rank == 0:
             _print_plan(args)
@@ -120,7 +120,7 @@ def run_train(args: Train, argv: Sequence[str]) -> None:
         _train_on_rank(args, rank_info)
     elif gpus > 1:
         device_of_rank(gpus - 1, args.machine.device)  # Raises an error if there are fewer.
-        launch(gpus, _run_in_rank, list(argv))
+        launch_ranks(gpus, _run_in_rank, list(argv))
     else:
         _train(args)
 
@@ -205,6 +205,7 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
         if ranks is not None and ranks.info.several_nodes:
             ranks.request_photos(request)
         flags = {name: getattr(output, name) for name in ("resume", "overwrite", "tensorboard")}
+        # No variable holds the scene: compensated photos would be in memory twice.
         trainer = create_trainer(request.load(), out, config, device=device, data=data, ranks=ranks, **flags)
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
@@ -236,7 +237,7 @@ def _print_result(args: Train, run: "Run", advice: Sequence[str] = ()) -> None:
     print(json.dumps(summary) if args.output.json else "\n".join([_ending(run.path, summary), *advice]))
 
 
-def _check_blocks(args: Train) -> bool:
+def _uses_blocks(args: Train) -> bool:
     """Return whether a command line trains in blocks, as --resume of such a run does too; refuse what cannot be."""
     from ..blocks.block_plan import MOST_BLOCKS
     from ..blocks.train import is_in_blocks

@@ -104,7 +104,9 @@ class Dropout:
 
 
 class GradientStep:
-    """Takes gradient steps of a training; see the functions.
+    """Takes gradient steps of a training: prepare(), then run().
+
+    On several GPUs, StepRunner calls the parts of run() one by one.
 
     Attributes:
         field: The field that is trained.

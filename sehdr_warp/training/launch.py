@@ -136,7 +136,7 @@ def open_store(info: RankInfo, timeout: float) -> dist.Store:
         raise SehdrError(f"{problem}; {remedy}") from None
 
 
-def launch(count: int, run: Callable[[list[str]], None], words: list[str]) -> None:
+def launch_ranks(count: int, run: Callable[[list[str]], None], words: list[str]) -> None:
     """Run a command line in `count` processes, one per rank, and exit with their status.
 
     `run` runs a command line in a process; raises SehdrError if a rank is killed.
@@ -146,9 +146,8 @@ def launch(count: int, run: Callable[[list[str]], None], words: list[str]) -> No
     with tempfile.TemporaryDirectory(prefix="sehdr-warp-") as folder:
         store_path = str(Path(folder) / "ranks")
         store = dist.FileStore(store_path, count + 1)
-        context = processes.start_processes(
-            _rank, (count, run, words, store_path), count, join=False, start_method="spawn"
-        )
+        arguments = count, run, words, store_path
+        context = processes.start_processes(_rank, arguments, count, join=False, start_method="spawn")
         assert context is not None
         _forward_signals(context)
         killed = None

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..model.adam import BETAS, Adam
 from ..model.gaussians import PARAMETER_NAMES
 from ..model.radiance_field import RadianceField
-from ..runs.checkpoint import under
+from ..runs.checkpoint import part_of
 from ..runs.config import Config
 
 # Higher harmonics are 3/4 of all parameters and the Adam step is bandwidth-bound, so on a GPU each step updates
@@ -76,7 +76,7 @@ def optimizer_tensors(optimizer: Adam, batch: int = 1) -> dict[str, Tensor]:
 def load_optimizer_tensors(optimizer: Adam, tensors: dict[str, Tensor], batch: int = 1) -> None:
     """Continue from optimizer_tensors()."""
     for prefix, parameter in named_parameters(optimizer):
-        if state := under(tensors, prefix):
+        if state := part_of(tensors, prefix):
             optimizer.state[parameter] = {
                 key: value.to(parameter.device, copy=True).reshape(() if key == "step" else parameter.shape)
                 for key, value in state.items()

@@ -27,7 +27,7 @@ MAX_RESERVE = 1.5  # Largest number of reserved rows as a multiple of the count;
 
 
 class StepRunner:
-    """Runs gradient steps: as CUDA graphs if that is possible, else kernel by kernel, as on a CPU.
+    """Runs gradient steps: as CUDA graphs if that is possible, else by GradientStep.run(), as on a CPU.
 
     On one GPU, a step is one graph. On several, it is two, and gradients are averaged between.
 

@@ -20,7 +20,7 @@ from ..runs.field import field_from_checkpoint
 from ..runs.open import in_world_of_run
 from ..runs.run import Run, exposure_compensation
 from ..runs.run_writer import RunWriter
-from ..runs.scene_description import FOUND
+from ..runs.scene_description import SFM_LAYOUTS
 from ..runs.values import LoadArguments
 from ..scene import Scene
 from ..scene.normalization import Normalization, normalization_of
@@ -138,7 +138,10 @@ def _new_trainer(
     *,
     overwrite: bool,
 ) -> Trainer:
-    """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder."""
+    """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder.
+
+    `scene` and `photos` are in the photos' own coordinates, `normalized` in those of the Gaussians.
+    """
     normalization = normalization_of(scene)
     normalized = normalization.scene(scene)
     plan = make_plan(normalized, config, device) if config.plan.enabled else None
@@ -175,7 +178,11 @@ def _new_trainer(
 def _resumed_trainer(
     scene: Scene, config: Config | None, device: torch.device, ranks: Ranks | None, folder: RunWriter
 ) -> Trainer:
-    """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run."""
+    """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run.
+
+    More iterations are allowed: they stretch the schedule or, after its end, extend it (Config.continued_after). They
+    are saved in extension.json.
+    """
     folder.lock()
     info, saved = folder.read_info(), folder.read_config()
     before = saved.schedule.iterations
@@ -184,7 +191,7 @@ def _resumed_trainer(
         saved = override_config(saved, {"schedule.iterations": max(before, config.schedule.iterations)})
         require_same_config(config, saved, folder.config_file, "resume with the run's own config, or train anew")
     # The Gaussians are in the world that structure from motion found when the training began.
-    cameras = {entry.name: entry.camera for entry in folder.read_cameras()} if scene.format in FOUND else {}
+    cameras = {entry.name: entry.camera for entry in folder.read_cameras()} if scene.format in SFM_LAYOUTS else {}
     unit = Normalization.from_dict(info["normalization"]).unit
     scene = in_world_of_run(scene, cameras, unit, folder.path, scene.name)
     folder.check_same_scene(scene)

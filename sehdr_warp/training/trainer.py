@@ -4,10 +4,12 @@ Read `Trainer.__iter__` for the loop and `Trainer.step` for a step: gradient ste
 gradient step (forward, loss, backward, optimizer) is in gradient_step.py; run_output.py evaluates, logs and saves, and
 training_state.py lists what a checkpoint holds. On several ranks, each runs this loop; only rank 0 has an output.
 
-A gradient step is GradientStep.run(). Its compute_gradients() calls RadianceField.render_train_view() -> rasterize()
-(kernels project, tiles, blend_cuda or blend_cpu), then data_loss() and differentiate(); its apply_gradients() calls
-decide_step() -> Adam.step() (on a GPU, kernels step_updates). On a GPU, StepRunner.run() captures it as a CUDA graph;
-a replay repeats its kernels. create_trainer() writes the checkpoint of iteration 0, before the first step.
+Trainer.step() -> StepRunner.run() -> GradientStep.run(). Its compute_gradients() calls
+RadianceField.render_train_view() -> spherical_harmonics() (kernels harmonics) and rasterize() (kernels project, tiles,
+blend_cuda or blend_cpu), then data_loss() and differentiate(); its apply_gradients() calls decide_step() -> Adam.step()
+(on a GPU, kernels step_updates). On a GPU, StepRunner.run() captures it as a CUDA graph; a replay repeats its kernels.
+Before the first step, create_trainer() matches points between photos (kernels plane_sweep), makes the Gaussians, and
+writes the checkpoint of iteration 0.
 """
 
 import logging

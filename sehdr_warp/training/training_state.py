@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from ..runs.checkpoint import Checkpoint, under
+from ..runs.checkpoint import Checkpoint, part_of
 from .gradient_step import OVERFLOWED, SKIPPED
 from .optimizer import load_optimizer_tensors, optimizer_tensors
 
@@ -37,16 +37,16 @@ def state_of(trainer: Trainer) -> Checkpoint:
 def load_state(trainer: Trainer, state: Checkpoint) -> None:
     """Continue from a state; the Gaussians of the trainer's field must already be those of the state."""
     tensors, values, device = state.tensors, state.values, trainer.device
-    load_optimizer_tensors(trainer.optimizer, under(tensors, "optimizer."), trainer.batch)
-    statistics = {name: value.to(device) for name, value in under(tensors, "densification.").items()}
+    load_optimizer_tensors(trainer.optimizer, part_of(tensors, "optimizer."), trainer.batch)
+    statistics = {name: value.to(device) for name, value in part_of(tensors, "densification.").items()}
     trainer.strategy.load_state_dict(statistics)
     # A stretched schedule may start its average later: samples until now are then of other Gaussians.
-    average = under(tensors, "average.") if values["iteration"] > trainer.average.first else {}
+    average = part_of(tensors, "average.") if values["iteration"] > trainer.average.first else {}
     trainer.average.means = {name: value.to(device) for name, value in average.items()}
     if trainer.ranks is not None and not trainer.ranks.is_main_process:  # The sum over the ranks counts them once.
         for total in statistics.values():
             total.zero_()
-    generators = under(tensors, "generators.")
+    generators = part_of(tensors, "generators.")
     trainer.sampler.load_state(generators["order"], values["order"])
     if trainer.generator.get_state().numel() == generators["device"].numel():
         trainer.generator.set_state(generators["device"].cpu())

@@ -12,7 +12,7 @@ from ..runs.config import Config
 from ..runs.field import field_from_checkpoint
 from ..runs.open import PhotoRequest, in_world_of_run
 from ..runs.run import exposure_compensation
-from ..runs.scene_description import FOUND, describe_scene, scene_difference
+from ..runs.scene_description import SFM_LAYOUTS, describe_scene, scene_difference
 from ..scene import Camera, Scene
 from ..scene.normalization import Normalization
 from .cost import gain_of_ranks
@@ -88,7 +88,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
 
 def _in_world_of_rank_0(scene: Scene, message: TrainingMessage) -> Scene:
     """Return a scene with rank 0's cameras if structure from motion found them: each node may find another world."""
-    if scene.format not in FOUND or message.scene is None:
+    if scene.format not in SFM_LAYOUTS or message.scene is None:
         return scene
     cameras = {view["name"]: Camera.from_dict(view["camera"]) for view in message.scene["views"]}
     unit = Normalization.from_dict(message.info["normalization"]).unit

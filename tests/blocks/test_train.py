@@ -169,7 +169,9 @@ def test_a_job_of_this_machine_sees_its_gpu_alone(monkeypatch, tmp_path):
 def test_one_training_that_does_for_auto_takes_all_gpus(survey, tmp_path, monkeypatch, flag):
     started = []
     monkeypatch.setattr("sehdr_warp.blocks.train.train_in_blocks", lambda *_, **__: None)
-    monkeypatch.setattr("sehdr_warp.training.launch.launch", lambda count, _, words: started.append((count, words)))
+    monkeypatch.setattr(
+        "sehdr_warp.training.launch.launch_ranks", lambda count, _, words: started.append((count, words))
+    )
     words = ["train", str(survey), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu"]
     assert call(*[*words, *flag]) == 0
     assert started == [(2, words)]

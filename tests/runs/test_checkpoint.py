@@ -8,7 +8,7 @@ import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.files import _beside
-from sehdr_warp.runs.checkpoint import PICTURE, read_checkpoint
+from sehdr_warp.runs.checkpoint import RENDER_TENSORS, read_checkpoint
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.runs.run_writer import RunWriter
 from tests.make_scenes import edited_json
@@ -106,6 +106,6 @@ def test_a_wrong_tensor_file_with_a_right_hash_is_refused(folder):
 def test_only_the_parts_that_are_asked_for_are_read_and_checked(folder):
     values = {"gaussians.means": torch.ones(2, 3), "optimizer.means.step": torch.tensor(float("nan"))}
     path = folder.write_checkpoint(values, {"iteration": 1, "seconds": 1.0}, keep=1)
-    assert list(read_checkpoint(path, PICTURE).tensors) == ["gaussians.means"]
+    assert list(read_checkpoint(path, RENDER_TENSORS).tensors) == ["gaussians.means"]
     with pytest.raises(InputError, match=r"optimizer\.means\.step holds values that are not finite"):
         read_checkpoint(path)
