@@ -215,9 +215,12 @@ def test_interpolation_passes_through_its_cameras():
     assert len(interpolate(camera_path[:1], 4)) == 4
 
 
-def test_paths_need_cameras():
-    with pytest.raises(SehdrError, match=r"no training views.*cameras.json"):
+def test_paths_need_cameras(tmp_path):
+    with pytest.raises(SehdrError, match=r"no training views.*file of cameras"):
         interpolate([], 3)
+    for choice in ("test", "all", "orbit"):  # As of a file of Gaussians without a file of cameras beside it
+        with pytest.raises(SehdrError, match=rf"no cameras of its own, and {choice} needs them; .*which export writes"):
+            render_views(AnalyticRun([]), tmp_path / "out", cameras=choice)
     with pytest.raises(SehdrError, match="path cannot have 0 views"):
         orbit(arc(3, 30), 0, 1)
 

@@ -152,9 +152,7 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
 
 def _check(cameras: Sequence[Camera], count: int) -> None:
     if not cameras:
-        problem = "there are no training views, and a camera path follows theirs"
-        remedy = "give a file of cameras, or a file of Gaussians beside its cameras.json (from export --cameras)"
-        raise SehdrError(f"{problem}; {remedy}")
+        raise SehdrError("there are no training views, and a camera path follows theirs; give a file of cameras")
     if not 1 <= count <= _LONGEST:
         raise SehdrError(f"a camera path cannot have {count} views; ask for a count of 1 to {_LONGEST}")
 

@@ -54,6 +54,9 @@ def select_cameras(
     refuse_paths("load_run", run)
     check_cameras(cameras)
     text = str(cameras)
+    if not run.cameras and text in SPLITS + PATHS:
+        remedy = "name a file of cameras, or put one beside it, which export writes with --cameras"
+        raise InputError(run.path, f"has no cameras of its own, and {text} needs them", remedy)
     if camera is not None and text in PATHS:
         raise SehdrError(f"--camera {camera}: chooses a photo or from a file of cameras, which --cameras {text} is not")
     if text in SPLITS and camera is not None:
@@ -62,7 +65,7 @@ def select_cameras(
         views = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]
         if not views:
             others = ", ".join(word for word in SPLITS + PATHS if word != text)
-            raise SehdrError(f"the run has no {text} views; choose other cameras ({others}, a file)")
+            raise SehdrError(f"{run.path}: has no {text} views; choose other cameras ({others}, a file)")
     elif text in PATHS:
         photos = training_cameras(run)
         path = default_path(run, count, up) if text == "orbit" else interpolate(photos, count)

@@ -1,6 +1,6 @@
 """Scene-linear pictures: OpenEXR, single and multi-part, with the metadata that HDR tools read; and Radiance HDR.
 
-In every file that this package writes, a color pixel is radiance times `expTime`, which is 1 in a picture of radiance.
+In every OpenEXR file that this package writes, a color pixel is radiance times `expTime`, 1 in a picture of radiance.
 docs/formats.md lists the attributes and the conventions of the matrices.
 """
 
