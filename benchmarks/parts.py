@@ -33,7 +33,7 @@ KERNELS = {
         "point_backward_*",
         "unit_backward_*",
     ),
-    "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*", "sum_opacities*", "sum_sizes*"),
+    "losses": ("compare_*", "gradient_in_*", "clipped_*", "code_residual_*", "sum_opacities*"),
     "blend, backward": ("blend_backward_*",),
     "projection, backward": ("project_*_backward",),
     "optimizer": ("update_*", "find_nonfinite_*", "decide_step_*"),

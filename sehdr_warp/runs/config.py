@@ -132,7 +132,7 @@ class LossConfig(_Table):
     last relocation on and, where a photo shows less than a tenth of the scene, for new Gaussians until a photo shows
     them; more leaves surfaces transparent"""
     size_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
-    """weight of the mean angular size of the Gaussians, as seen from the photo's camera, which shrinks those that no
+    """weight of the mean size of the Gaussians in units of the cameras' radius (3DGS-MCMC), which shrinks those that no
     photo supports, and which can lie as veils before new views; it is 0 from the last relocation on, and where a photo
     shows less than a tenth of the scene"""
 

@@ -40,7 +40,7 @@ class StepOptions:
 
     degree: int  # SH degree
     opacity_weight: float  # Weight of the mean opacity in the loss
-    size_weight: float  # Weight of the mean angular size in the loss
+    size_weight: float  # Weight of the mean size in the loss
     needs_means2d_grad: bool  # Whether the strategy accumulates the gradients of the projected means
 
 
@@ -207,7 +207,7 @@ class GradientStep:
             moments = moments_of(self.optimizer, field.gaussians.opacity_logits) if spares_unseen else {}
             loss = loss + opacity_loss(field, render, options.opacity_weight, moments.get("exp_avg_sq"))
         if options.size_weight and not self._spares_unseen:
-            loss = loss + size_loss(field, camera, options.size_weight)
+            loss = loss + size_loss(field.gaussians, options.size_weight)
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in it.
         dropped = {"image", "transmittance", "depths"}
         if options.needs_means2d_grad:

@@ -1,19 +1,21 @@
 """The loss of a training step: photos against renders, HDR truth against exposures."""
 
+import torch
 from torch import Tensor
 
+from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
-from ..model.renders import CameraTensors, TrainRender
+from ..model.renders import TrainRender
 from ..rasterizer.losses.code_residual import code_residual
 from ..rasterizer.losses.opacity_penalty import opacity_penalty
 from ..rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
-from ..rasterizer.losses.size_penalty import size_penalty
 from ..rasterizer.losses.ssim import image_distance, ssim
 from ..response import Response, ToneMapper
 from ..runs.config import LossConfig
 from .targets import Target, mu_law
 
 ANCHOR = 0.5  # Encoded value of the unit exposure that anchor_loss aims at: the middle of the range
+MAX_LOG_SIZE = 20.0  # Sizes above e ** MAX_LOG_SIZE count as that, so that size_loss stays finite
 
 
 def image_loss(prediction: Tensor, truth: Tensor, mask: Tensor | None, form: str, weight: float) -> Tensor:
@@ -153,7 +155,14 @@ def opacity_loss(field: RadianceField, render: TrainRender, weight: float, momen
     return opacity_penalty(render.opacities, extents, moments, weight, field.gaussians.active_count)
 
 
-def size_loss(field: RadianceField, camera: CameraTensors, weight: float) -> Tensor:
-    """Return `weight` times the mean angular size of the Gaussians, as seen from a camera."""
-    gaussians = field.gaussians
-    return size_penalty(gaussians.log_scales, gaussians.means, camera.position, weight, gaussians.active_count)
+def size_loss(gaussians: Gaussians, weight: float) -> Tensor:
+    """Return `weight` times the mean of all standard deviations, in units of the normalized world.
+
+    Adam moves a parameter by about its rate however small its gradient is. So a small weight shrinks the Gaussians that
+    no photo supports, and hardly changes the others. Source: 3DGS-MCMC (NeurIPS 2024), equation 10.
+    """
+    sizes = gaussians.log_scales.clamp_max(MAX_LOG_SIZE).exp()
+    if gaussians.active_count is None:
+        return weight * sizes.mean()
+    is_active = torch.arange(len(sizes), device=sizes.device) < gaussians.active_count
+    return weight * (sizes * is_active[:, None]).sum() / (3 * gaussians.active_count[0])

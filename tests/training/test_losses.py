@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.renders import TrainRender
 from sehdr_warp.rasterizer.losses.code_residual import code_tensor
 from sehdr_warp.rasterizer.losses.ssim import ssim
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import LossConfig
-from sehdr_warp.training.losses import image_loss, ldr_loss, linear_loss
+from sehdr_warp.training.losses import MAX_LOG_SIZE, image_loss, ldr_loss, linear_loss, size_loss
 from sehdr_warp.training.targets import CODE, Target, code_scale, mu_law, mu_of_knee
 
 
@@ -193,3 +194,26 @@ def test_truth_supervises_the_base_and_without_it_there_may_be_nothing_to_compar
     assert linear_loss(photo, target_of(truth, truth=base), config).item() == pytest.approx(0, abs=1e-6)
     assert linear_loss(photo, target_of(truth, truth=truth), config) > 0.1
     assert linear_loss(TrainRender(base, base, base, None), target_of(base), LossConfig()) is None
+
+
+@pytest.mark.parametrize("reserved", [0, 5])
+def test_the_size_loss_is_the_mean_size_and_its_gradient_is_exact(device, reserved):
+    log_scales = torch.randn(40, 3, generator=torch.Generator().manual_seed(1)) - 3
+    log_scales[0], log_scales[1] = -math.inf, math.inf
+    exact = log_scales.double().clamp_max(MAX_LOG_SIZE).requires_grad_()
+    expected = 0.7 * exact.exp().mean()
+    expected.backward()
+    gaussians = Gaussians.from_points(torch.zeros(40, 3), torch.ones(40, 3), 2).to(device)
+    gaussians.log_scales.data.copy_(log_scales)
+    optimizer = torch.optim.Adam(gaussians.parameters())
+    if reserved:
+        gaussians.reserve(40 + reserved, optimizer)
+    with gaussians.all_rows(optimizer):
+        loss = size_loss(gaussians, 0.7)
+        loss.backward()
+        gradient = gaussians.log_scales.grad
+    assert len(gradient) == 40 + reserved
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+    # The one without bound stays: its size is not that of its parameter.
+    torch.testing.assert_close(gradient[2:40].cpu(), exact.grad[2:].float(), rtol=1e-5, atol=0)
+    assert gradient.isfinite().all() and not gradient[:2].any() and not gradient[40:].any()
