@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -50,6 +51,153 @@ def best_if_overfitted(points: Sequence[Evaluation]) -> Evaluation | None:
     return best if best is not None and best.psnr - points[-1].psnr > FALLING else None
 
 
+@dataclass(frozen=True)
+class FinishedTraining:
+    """Facts of a finished training that advice rests on."""
+
+    path: Path  # Folder of the run
+    summary: Mapping[str, Any]  # Run.summary() with the list of evaluations as "metrics"
+    train_photos: int  # Number of photos that were trained on
+    scene: str = "SCENE"  # Where the photos are, for the commands
+    options: Sequence[str] = ()  # Words of the command line that the training had, for the commands: --max-size 240
+    # Iteration at which the training was resumed, 0 if it was not. If held-out photos were evaluated there, as at the
+    # end of a run that is given more steps, gains before it do not count.
+    resumed_at: int = 0
+    unplaced: int = 0  # Number of photos without a camera
+    steps: int | None = None  # Iterations that the user set, for the commands; None if they were planned
+    posed: str | None = None  # Folder of the photos, if the set states their cameras; None if they were found
+    misfit: bool = False  # Whether a note says that the stated cameras do not fit the photos
+    # Pixels of the training photos, by their names; without them no single camera is called wrong
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    uncertain: Collection[str] = ()  # Names of the training photos that structure from motion placed by few points
+
+    def _command(self, scene: str, steps: int | None = None) -> str:
+        """Return the command that trains a scene with the options of this training."""
+        words = ["sehdr-warp", "train", scene, "--out", str(self.path), *self.options, "--overwrite"]
+        return shlex.join(words if steps is None else [*words, "--iterations", str(steps)])
+
+    @property
+    def _again(self) -> str:
+        """The command that repeats this training."""
+        return self._command(self.scene, self.steps)
+
+    @property
+    def _anew(self) -> str:
+        """Photos to find the cameras anew from, and the command that does."""
+        if self.posed is not None and Path(self.posed).resolve() != Path(self.scene).resolve():
+            return f"from the photos alone: {self._command(self.posed)}"
+        return f"from the photos in a folder PHOTOS of their own: {self._command('PHOTOS')}"
+
+    def advice(self) -> list[str]:
+        """Return lines of advice; none if nothing stands out."""
+        summary, train_photos, again = self.summary, self.train_photos, self._again
+        run, iterations = shlex.quote(str(self.path)), int(summary["iteration"])
+        points, lines, gain = evaluations(summary["metrics"]), [], 0.0
+        if self.misfit:
+            return [f"the cameras that the set states do not fit its photos; find them anew {self._anew}"]
+        if (share := summary.get("estimated_light") or 0.0) > _MUCH_LIGHT:
+            remedy = (
+                "photos in which lamps do not clip measure it; this says which lights lack them, and how many stops"
+            )
+            estimated = f"{share:.0%} of the light is an estimate, because photos clip it"
+            lines.append(f"{estimated}; {remedy}: sehdr-warp lights {run}")
+        few_placed = 2 * self.unplaced >= train_photos
+        if few_placed:
+            between = f"photos from places between them and the {train_photos} others would help most"
+            lines.append(f"{self.unplaced} photos have no camera and are not in the scene; {between}: {again}")
+        is_long = iterations >= STEPS_PER_PHOTO * train_photos  # Blur has gone away, however few evaluations show it.
+        if len(points) >= 3 or (points and is_long):
+            since = iterations * 2 / 3 + 1
+            if any(point.iteration == self.resumed_at for point in points):  # Its schedule had ended there.
+                since = max(since, self.resumed_at)
+            earlier = [point for point in points[:-1] if point.iteration <= since] or points[:1]
+            before = max(earlier, key=attrgetter("psnr"))
+            if before.iteration >= iterations / 3 or not is_long:
+                gain = points[-1].psnr - before.psnr
+            if gain < UNFINISHED and not few_placed and (best := max(point.psnr for point in points)) < FAILED:
+                remedy = "photos from places between them would help most"
+                remedy += f"; or find their cameras anew {self._anew}" if self.posed else f": {again}"
+                likely = "photos overlap too little, show different light, or their cameras are wrong"
+                problem = f"held-out photos reach {best:.1f} dB at best, so the scene as a whole does not fit"
+                return [f"{problem}: {likely}; {remedy}"]
+            if gain > STILL_RISING:
+                command = f"sehdr-warp train --resume --out {run} --iterations {2 * iterations}"
+                gained = f"held-out photos gained {gain:.1f} dB since iteration {before.iteration}"
+                lines.append(f"{gained}; more steps help: {command}")
+            elif best := best_if_overfitted(points):
+                better = f"{best.psnr - points[-1].psnr:.1f} dB better at iteration {best.iteration}"
+                remedy = f"add photos from other places, or stop there: {self._command(self.scene, best.iteration)}"
+                lines.append(f"held-out photos were {better}: {train_photos} photos hold no more; {remedy}")
+            elif not few_placed and train_photos < _FEW_PHOTOS and points[-1].psnr < 25:
+                nearer = "more from places between them, and nearer, would help most"
+                lines.append(f"{train_photos} photos are few: {nearer}: {again}")
+        if wrong := self._wrong_cameras():
+            lines.append(wrong)
+        elif gain < UNFINISHED and (is_long or len(points) not in (1, 2)):  # Few do not show whether blur goes away.
+            if jump := self._exposure_jump():
+                lines.append(jump)
+            elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
+                lines.append(f"{train_photos} photos are few: more from places between them would help most: {again}")
+            elif gain <= STILL_RISING:
+                lines += self._movement()
+        return lines
+
+    def _exposure_jump(self) -> str | None:
+        """Return advice on photos whose brightness differs from the scene's as a whole."""
+        offsets: Mapping[str, float] = self.summary.get("brightness_offsets") or {}
+        jumps = sorted(
+            (name for name in offsets if abs(offsets[name]) >= EXPOSURE_JUMP), key=lambda n: -abs(offsets[n])
+        )
+        if not jumps:
+            return None
+        names = first_names([f"{name} {offsets[name]:+.1f}" for name in jumps])
+        what = f"{len(jumps)} photo{'s are' if len(jumps) > 1 else ' is'} brighter or darker than the scene as a whole"
+        if 2 * len(jumps) > len(offsets):
+            reason, remedy = "in photos of several days or cameras", "train on those of one day"
+        else:
+            reason = "where exposure or sun changed"
+            remedy = "state their exposure times in exposures.json beside the photos, or move them elsewhere"
+        return f"{what} (stops: {names}), as {reason}: {remedy}: {self._again}"
+
+    def _wrong_cameras(self) -> str | None:
+        """Return advice on single photos that differ from the scene by stops over a large part, as no blur does.
+
+        Photos that are brighter or darker as a whole are left to their exposure.
+        """
+        areas: dict[str, float] = {}
+        offsets = self.summary.get("brightness_offsets") or {}
+        for region in (self.summary.get("unexplained") or {}).get("worst", ()):
+            photo, stops = region["photo"], abs(region["stops"])
+            if photo in self.sizes and stops >= max(_WRONG_STOPS, 2 * abs(offsets.get(photo, 0.0))):
+                areas[photo] = areas.get(photo, 0.0) + region["pixels"] / self.sizes[photo]
+        names = [photo for photo, area in areas.items() if area >= _WRONG_AREA]
+        if not 0 < len(names) <= _FEW * len(self.sizes):
+            return None
+        several = len(names) > 1
+        what = f"the camera{'s' if several else ''} of {first_names(names, 10)} seem{'' if several else 's'} wrong"
+        shows = "these photos alone show" if several else "this photo alone shows"
+        reason = f"{shows} another scene over much of the picture"
+        return f"{what}: {reason}; leave {'them' if several else 'it'} out: {self._again}"
+
+    def _movement(self) -> list[str]:
+        """Return advice on masks or uncertain cameras, if photos differ from the scene in many places, not by blur."""
+        unexplained: Mapping[str, Any] = self.summary.get("unexplained") or {}
+        worst: Sequence[Mapping[str, Any]] = unexplained.get("worst", ())
+        if not worst or unexplained["regions"] < _MANY_REGIONS * max(self.train_photos, 1):
+            return []
+        stops = sorted(abs(region["stops"]) for region in worst)
+        if stops[len(stops) // 2] < _REGION_STOPS:
+            return []
+        photos = list(dict.fromkeys(region["photo"] for region in worst))
+        text = "photos and scene differ in many places"
+        if 2 * sum(region["photo"] in self.uncertain for region in worst) > len(worst):
+            names = first_names([photo for photo in photos if photo in self.uncertain])
+            remedy = "add photos from places between them and the others, or leave them out"
+            return [f"{text}, most in photos whose cameras are uncertain ({names}): {remedy}: {self._again}"]
+        remedy = "make these black in the photos' masks, masks/PHOTO.png beside them"
+        return [f"{text}, as where people or leaves move (worst in {first_names(photos)}): {remedy}: {self._again}"]
+
+
 def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) -> list[str]:
     """Return advice on a training, if it is finished; its commands repeat `data` and the other options by name."""
     run, scene = trainer.run, trainer.scene
@@ -60,7 +208,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
     posed = None
     if folders and scene.format not in SFM_LAYOUTS:
         posed = folders.pop() if len(folders) == 1 else place  # No folder holds the photos of several alone.
-    return advice(
+    training = FinishedTraining(
         run.path,
         run.summary() | {"metrics": run.metrics()},
         len(scene.train_views),
@@ -74,101 +222,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
         sizes={view.name: view.camera.width * view.camera.height for view in scene.train_views},
         uncertain={view.name for view in scene.train_views if view.uncertain},
     )
-
-
-def advice(
-    path: Path,
-    summary: Mapping[str, Any],
-    train_photos: int,
-    scene: str = "SCENE",
-    options: Sequence[str] = (),
-    *,
-    resumed_at: int = 0,
-    unplaced: int = 0,
-    steps: int | None = None,
-    posed: str | None = None,
-    misfit: bool = False,
-    sizes: Mapping[str, int] | None = None,
-    uncertain: Collection[str] = (),
-) -> list[str]:
-    """Return lines of advice on a finished training; none if nothing stands out.
-
-    Args:
-        path: Folder of the run.
-        summary: Run.summary() with the list of evaluations as "metrics".
-        train_photos: Number of photos that were trained on.
-        scene: Where the photos are, for the commands.
-        options: Words of the command line that the training had, such as --max-size 240, for the commands.
-        resumed_at: Iteration at which the training was resumed, 0 if it was not. If held-out photos were evaluated
-            there, as at the end of a run that is given more steps, gains before it do not count.
-        unplaced: Number of photos without a camera.
-        steps: Iterations that the user set, for the commands; None if they were planned.
-        posed: Folder of the photos, if the set states their cameras; None if structure from motion found them.
-        misfit: Whether a note says that the stated cameras do not fit the photos.
-        sizes: Pixels of the training photos, by their names; without them no single camera is called wrong.
-        uncertain: Names of the training photos that structure from motion placed by few points.
-    """
-    run, iterations = shlex.quote(str(path)), int(summary["iteration"])
-    shorter = shlex.join(["sehdr-warp", "train", scene, "--out", str(path), *options, "--overwrite"])
-    again = shorter if steps is None else f"{shorter} --iterations {steps}"
-    points, lines, gain = evaluations(summary["metrics"]), [], 0.0
-    alone = posed is not None and Path(posed).resolve() != Path(scene).resolve()
-    where = "from the photos alone" if alone else "from the photos in a folder PHOTOS of their own"
-    words = ["sehdr-warp", "train", posed if alone and posed else "PHOTOS", "--out", str(path), *options, "--overwrite"]
-    anew = f"{where}: {shlex.join(words)}"
-    if misfit:
-        return [f"the cameras that the set states do not fit its photos; find them anew {anew}"]
-    if (share := summary.get("estimated_light") or 0.0) > _MUCH_LIGHT:
-        remedy = "photos in which lamps do not clip measure it; this says which lights lack them, and how many stops"
-        estimated = f"{share:.0%} of the light is an estimate, because photos clip it"
-        lines.append(f"{estimated}; {remedy}: sehdr-warp lights {run}")
-    few_placed = 2 * unplaced >= train_photos
-    if few_placed:
-        lines.append(
-            f"{unplaced} photos have no camera and are not in the scene; photos from places between them and the "
-            f"{train_photos} others would help most: {again}"
-        )
-    is_long = iterations >= STEPS_PER_PHOTO * train_photos  # Blur has gone away, however few evaluations show it.
-    if len(points) >= 3 or (points and is_long):
-        since = iterations * 2 / 3 + 1
-        if any(point.iteration == resumed_at for point in points):  # Its schedule had ended there.
-            since = max(since, resumed_at)
-        earlier = [point for point in points[:-1] if point.iteration <= since] or points[:1]
-        before = max(earlier, key=attrgetter("psnr"))
-        if before.iteration >= iterations / 3 or not is_long:
-            gain = points[-1].psnr - before.psnr
-        if gain < UNFINISHED and not few_placed and (best := max(point.psnr for point in points)) < FAILED:
-            remedy = "photos from places between them would help most"
-            remedy += f"; or find their cameras anew {anew}" if posed else f": {again}"
-            likely = "photos overlap too little, show different light, or their cameras are wrong"
-            return [
-                f"held-out photos reach {best:.1f} dB at best, so the scene as a whole does not fit: {likely}; {remedy}"
-            ]
-        if gain > STILL_RISING:
-            command = f"sehdr-warp train --resume --out {run} --iterations {2 * iterations}"
-            lines.append(
-                f"held-out photos gained {gain:.1f} dB since iteration {before.iteration}; more steps help: {command}"
-            )
-        elif best := best_if_overfitted(points):
-            lines.append(
-                f"held-out photos were {best.psnr - points[-1].psnr:.1f} dB better at iteration {best.iteration}: "
-                f"{train_photos} photos hold no more; add photos from other places, or stop there: "
-                f"{shorter} --iterations {best.iteration}"
-            )
-        elif not few_placed and train_photos < _FEW_PHOTOS and points[-1].psnr < 25:
-            lines.append(
-                f"{train_photos} photos are few: more from places between them, and nearer, would help most: {again}"
-            )
-    if wrong := _wrong_cameras(summary, sizes or {}, again):
-        lines.append(wrong)
-    elif gain < UNFINISHED and (is_long or len(points) not in (1, 2)):  # Few do not show whether blur still goes away.
-        if jump := _exposure_jump(summary.get("brightness_offsets") or {}, again):
-            lines.append(jump)
-        elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.
-            lines.append(f"{train_photos} photos are few: more from places between them would help most: {again}")
-        elif gain <= STILL_RISING:
-            lines += _movement(summary.get("unexplained"), train_photos, uncertain, again)
-    return lines
+    return training.advice()
 
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
@@ -189,59 +243,3 @@ def options_of_run(run: Run) -> dict[str, str]:
         if value != item.default and name not in planned and name != "plan.keep":
             options[name] = field_text(value)
     return options
-
-
-def _exposure_jump(offsets: Mapping[str, float], again: str) -> str | None:
-    """Return advice on photos whose brightness differs from the scene's as a whole."""
-    jumps = sorted((name for name in offsets if abs(offsets[name]) >= EXPOSURE_JUMP), key=lambda n: -abs(offsets[n]))
-    if not jumps:
-        return None
-    names = first_names([f"{name} {offsets[name]:+.1f}" for name in jumps])
-    what = f"{len(jumps)} photo{'s are' if len(jumps) > 1 else ' is'} brighter or darker than the scene as a whole"
-    if 2 * len(jumps) > len(offsets):
-        reason, remedy = "in photos of several days or cameras", "train on those of one day"
-    else:
-        reason = "where exposure or sun changed"
-        remedy = "state their exposure times in exposures.json beside the photos, or move them elsewhere"
-    return f"{what} (stops: {names}), as {reason}: {remedy}: {again}"
-
-
-def _wrong_cameras(summary: Mapping[str, Any], sizes: Mapping[str, int], again: str) -> str | None:
-    """Return advice on single photos that differ from the scene by several stops over a large part, as no blur does.
-
-    Photos that are brighter or darker as a whole are left to their exposure.
-    """
-    areas: dict[str, float] = {}
-    offsets = summary.get("brightness_offsets") or {}
-    for region in (summary.get("unexplained") or {}).get("worst", ()):
-        photo, stops = region["photo"], abs(region["stops"])
-        if photo in sizes and stops >= max(_WRONG_STOPS, 2 * abs(offsets.get(photo, 0.0))):
-            areas[photo] = areas.get(photo, 0.0) + region["pixels"] / sizes[photo]
-    names = [photo for photo, area in areas.items() if area >= _WRONG_AREA]
-    if not 0 < len(names) <= _FEW * len(sizes):
-        return None
-    several = len(names) > 1
-    what = f"the camera{'s' if several else ''} of {first_names(names, 10)} seem{'' if several else 's'} wrong"
-    shows = "these photos alone show" if several else "this photo alone shows"
-    reason = f"{shows} another scene over much of the picture"
-    return f"{what}: {reason}; leave {'them' if several else 'it'} out: {again}"
-
-
-def _movement(
-    unexplained: Mapping[str, Any] | None, train_photos: int, uncertain: Collection[str], again: str
-) -> list[str]:
-    """Return advice on masks, or on uncertain cameras, if photos differ from the scene in many places, not by blur."""
-    worst: Sequence[Mapping[str, Any]] = (unexplained or {}).get("worst", ())
-    if not worst or unexplained is None or unexplained["regions"] < _MANY_REGIONS * max(train_photos, 1):
-        return []
-    stops = sorted(abs(region["stops"]) for region in worst)
-    if stops[len(stops) // 2] < _REGION_STOPS:
-        return []
-    photos = list(dict.fromkeys(region["photo"] for region in worst))
-    text = "photos and scene differ in many places"
-    if 2 * sum(region["photo"] in uncertain for region in worst) > len(worst):
-        names = first_names([photo for photo in photos if photo in uncertain])
-        remedy = "add photos from places between them and the others, or leave them out"
-        return [f"{text}, most in photos whose cameras are uncertain ({names}): {remedy}: {again}"]
-    remedy = "make these black in the photos' masks, masks/PHOTO.png beside them"
-    return [f"{text}, as where people or leaves move (worst in {first_names(photos)}): {remedy}: {again}"]

@@ -6,10 +6,14 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.config_flags import parse_field
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene.pose_conventions import MISFIT
-from sehdr_warp.training.advice import advice, advice_on, option_words, options_of_run
+from sehdr_warp.training.advice import FinishedTraining, advice_on, option_words, options_of_run
 from sehdr_warp.training.train import train
 
 from .toy import toy_scene
+
+
+def advice(*facts, **more):
+    return FinishedTraining(*facts, **more).advice()
 
 
 def summary(decibels, regions=0, stops=2.0):
