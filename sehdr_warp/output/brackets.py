@@ -19,15 +19,7 @@ from ..own_files import is_own
 from ..scene import Camera
 from ..scene.file_names import safe_names
 from .images.colorspace import from_rec709
-from .images.exr import (
-    PAST_HALF,
-    Part,
-    check_finite,
-    check_pixel_type,
-    rgb_channels,
-    stored_pixel_type,
-    write_multipart_exr,
-)
+from .images.exr import PAST_HALF, check_finite, check_pixel_type, stored_pixel_type, write_multipart_exr
 from .images.ldr_files import exposure_exif, quantize, write_picture
 from .picture_header import PictureHeader
 
@@ -158,7 +150,7 @@ class BracketWriter:
 
     out: Path  # Folder that the files belong to
     exposures: tuple[Exposure, ...]  # Ascending, as from bracket_exposures
-    header: PictureHeader  # EXR attributes of the pictures
+    header: PictureHeader  # Of the pictures
     pixel: str = "half"  # "half" (float if half would overflow) or "float"
     multipart: bool = False  # One EXR file with all exposures of a view
     ldr: str | None = None  # One of LDR_FORMATS to add simulated photos through response.encode, or None
@@ -219,20 +211,19 @@ class BracketWriter:
         if radiance.shape[2:] != (3,):
             raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
         check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
-        linear = from_rec709(radiance, self.header.colorspace)
-        pixels = [linear * exposure.time for exposure in self.exposures]
         # One type for all exposures of a view, so that their ratios keep one precision.
-        pixel = stored_pixel_type(pixels, self.pixel)
+        pixel = stored_pixel_type([from_rec709(radiance, self.header.colorspace) * self.exposures[-1].time], self.pixel)
         # write_multipart_exr() sees one exposure, so it cannot tell why the type is another one.
-        reason = {"sehdr:pixelType": PAST_HALF} if pixel != self.pixel else {}
+        reason = {"pixelType": PAST_HALF} if pixel != self.pixel else {}
         if reason:
             log.info("%s: its brackets reach above 65504, which half cannot; written as float", name)
         parts, entries = [], []
-        digits = len(str(len(pixels) - 1))  # Tools sort files by name.
-        for index, (exposure, image) in enumerate(zip(self.exposures, pixels, strict=True)):
+        digits = len(str(len(self.exposures) - 1))  # Tools sort files by name.
+        for index, exposure in enumerate(self.exposures):
             label = f"b{index:0{digits}d}_{exposure.label}"
-            attributes = self.header.attributes(exposure.time, camera, view=name, ev=repr(exposure.ev)) | reason
-            parts.append(Part(rgb_channels(image), attributes, label if self.multipart else ""))
+            facts = {"view": name, "ev": repr(exposure.ev), **reason}
+            title = label if self.multipart else ""
+            parts.append(self.header.part(radiance, exposure.time, camera, name=title, **facts))
             place = f"{name}/{name}_{label}" if self.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if self.multipart else f"{place}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}

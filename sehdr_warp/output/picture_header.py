@@ -1,14 +1,16 @@
-"""The EXR attributes that all pictures of a render share: exposure, colors, time, and where the scene came from."""
+"""Pictures as parts of EXR files: colors that are radiance times `expTime`, and attributes that a render's share."""
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ..scene import Camera
-from .images.colorspace import color_space
-from .images.exr import exr_header
+from .images.colorspace import color_space, from_rec709
+from .images.exr import Part, exr_header, rgb_channels
 from .lighting.unit import luminance_of_one, read_light_unit
 from .world_transform import WorldTransform, photos_to_file
 
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PictureHeader:
-    """EXR attributes that all pictures of a render share."""
+    """Attributes that all pictures of a render share."""
 
     base_time: float  # Seconds at 0 EV
     colorspace: str = "rec709"  # Primaries of the EXR files
@@ -37,11 +39,30 @@ class PictureHeader:
         now = datetime.now().replace(microsecond=0)
         return PictureHeader(run.base_time, colorspace, now, facts, luminance_of_one(run))
 
-    def attributes(self, exposure_time: float, camera: Camera | None, **provenance: str) -> dict[str, Any]:
-        """Return the EXR attributes of a picture; `provenance` is of this one alone."""
+    def part(
+        self,
+        radiance: np.ndarray,
+        exposure: float,
+        camera: Camera | None,
+        others: Mapping[str, np.ndarray] | None = None,
+        name: str = "",
+        **provenance: str,
+    ) -> Part:
+        """Return a picture as a part of a file; its colors are radiance times exposure, in the header's primaries.
+
+        Args:
+            radiance: [H, W, 3] linear Rec.709.
+            exposure: Seconds, 1 for a picture of radiance; `expTime` states it.
+            camera: Camera of the picture, if it has one.
+            others: Channels beside the colors.
+            name: Name of the part.
+            **provenance: Of this picture alone, text by key.
+        """
         values = {**self.provenance, **provenance, "baseExposureTime": repr(float(self.base_time))}
-        luminance = None if self.luminance_of_one is None else self.luminance_of_one / exposure_time
-        return exr_header(self.colorspace, exposure_time, camera, self.captured, values, luminance)
+        white = None if self.luminance_of_one is None else self.luminance_of_one / exposure
+        attributes = exr_header(self.colorspace, exposure, camera, self.captured, values, white)
+        colors = rgb_channels(from_rec709(radiance, self.colorspace) * exposure)
+        return Part(colors | dict(others or {}), attributes, name)
 
 
 def provenance(run: "RenderableScene") -> dict[str, str]:

@@ -1,10 +1,10 @@
 """Pictures of a trained scene: HDR files, previews and exposure brackets, for any set of cameras."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..errors import SehdrError, refuse_paths
 from ..files import atomic_folder, atomic_path
@@ -16,14 +16,13 @@ from ..subsets import evenly, first_names
 from .brackets import BracketWriter, bracket_exposures, remove_earlier
 from .cameras.exchange import camera_path, chan_cameras, nerfstudio_path, usd_cameras
 from .cameras.selection import check_cameras, may_move, read_size, select_cameras
-from .images.colorspace import from_rec709
 from .images.display import display_gain, exposure_for_white
-from .images.exr import Part, check_pixel_type, rgb_channels, write_multipart_exr
+from .images.exr import check_pixel_type, write_multipart_exr
 from .images.ldr_files import quantize, write_picture
 from .images.ocio import ocio_view
 from .images.tonemap import ToneMap, fit_tone_map
 from .picture_header import PictureHeader
-from .view_images import ViewImages, data_parts, read_aovs, render_images
+from .view_images import data_parts, read_aovs, render_images
 from .world_transform import WorldTransform, photos_to_file, photos_to_scene, world_transform
 
 if TYPE_CHECKING:
@@ -142,8 +141,12 @@ def render_views(
             images = render_images(run, view_camera, transform, aov_names)
             if images.confidence is None and index == 0:
                 log.info("without a confidence channel; for a run, `sehdr-warp report` measures it, from the photos")
-            attributes = header.attributes(hdr_exposure, images.camera, view=name)
-            parts = _hdr_parts(images, attributes, colorspace, hdr_exposure, aov_names)
+            channels = {"A": images.alpha, "Z": images.depth}
+            if images.confidence is not None:
+                channels["confidence"] = images.confidence
+            title = "rgba" if aov_names else ""  # A file of one part needs no name
+            picture = header.part(images.hdr, hdr_exposure, images.camera, channels, title, view=name)
+            parts = [picture, *data_parts(aov_names, images, picture.header)]
             if write_multipart_exr(hdr_folder / f"{name}.exr", parts, pixel=pixel) != pixel:
                 log.info("%s: holds values above 65504, which half cannot; written as float", name)
             write_picture(preview_folder / f"{name}.png", quantize(to_display(images.hdr)))
@@ -231,13 +234,3 @@ def shared_tone_map(run: "RenderableScene", cameras: Sequence[Camera]) -> ToneMa
     renders = [run.render(camera, supersample=False) for camera in small]
     pictures, alphas = zip(*((each.hdr.cpu().numpy(), each.alpha.cpu().numpy()) for each in renders), strict=True)
     return fit_tone_map(pictures, alphas, run.base_time * display_gain(run.response))
-
-
-def _hdr_parts(
-    images: ViewImages, attributes: Mapping[str, Any], colorspace: str, exposure: float, aovs: Sequence[str]
-) -> list[Part]:
-    """Return the parts of a file of `hdr/`: the picture, whose colors are radiance times exposure, and its AOVs."""
-    channels = rgb_channels(from_rec709(images.hdr, colorspace) * exposure) | {"A": images.alpha, "Z": images.depth}
-    if images.confidence is not None:
-        channels["confidence"] = images.confidence
-    return [Part(channels, attributes, "rgba" if aovs else ""), *data_parts(aovs, images, attributes)]

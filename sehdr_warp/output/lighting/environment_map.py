@@ -2,7 +2,7 @@
 
 import json
 import logging
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from ...scene.wide_camera import typical_focal_length
 from ..cameras.scene_cameras import training_cameras
 from ..images.colorspace import color_space, from_rec709
 from ..images.display import exposure_for_white
-from ..images.exr import Part, as_data, rgb_channels, write_multipart_exr, write_radiance
+from ..images.exr import Part, as_data, write_multipart_exr, write_radiance
 from ..picture_header import PictureHeader
 from ..world_transform import AXES, WorldTransform, world_transform
 from .map_center import MapCenter, find_center
@@ -117,58 +117,58 @@ def write_environment_map(
     added = np.zeros_like(rendered.hdr)
     if inpaint:
         directions = map_directions(size, layout) @ transform.rotation
-        light = inpainted_light(rendered.hdr, rendered.alpha, directions, weight)
-        added = (1 - rendered.alpha[..., None]) * light
+        added = (1 - rendered.alpha[..., None]) * inpainted_light(rendered.hdr, rendered.alpha, directions, weight)
     shares = light_shares(rendered.hdr, added, rendered.clipped, rendered.certain, weight)
     coverage = 100 * weight[rendered.alpha > COVERED].sum() / weight.sum()
     rest = "" if inpaint or coverage > _WHOLE else "; the rest is black, --inpaint fills it with the light around it"
     log.info("%s: %.0f %% of all directions seen%s", path.name, coverage, rest)
     log.info("its light is\n%s", shares.table())
-    hdr = exposure * from_rec709(rendered.hdr + added, colorspace)
-    luminance = luminance_of_one(run)
+    light = rendered.hdr + added
     if path.suffix.lower() == ".hdr":
+        luminance, hdr = luminance_of_one(run), exposure * from_rec709(light, colorspace)
         absolute = 1.0 if luminance is None else EFFICACY / luminance
         write_radiance(path, hdr, exposure=exposure * absolute, colorspace=colorspace, overwrite=overwrite)
         return path
-    header = map_header(run, center, transform, axes, layout, colorspace=colorspace, exposure=exposure)
-    header["sehdr:lightShares"] = json.dumps(shares.to_dict())
+    of_file = {"colorspace": colorspace, "exposure": exposure, "lightShares": json.dumps(shares.to_dict())}
+    picture = map_part(run, light, rendered.alpha, center, transform, axes, layout, name="rgba", **of_file)
     # In a part of their own: Mitsuba takes a map with a fifth channel for no map at all.
-    data = {
-        "distance.Z": rendered.distance * transform.scale,
-        "confidence": rendered.confidence,
-        "clipped": rendered.clipped,
-    }
+    data = {"distance.Z": rendered.distance * transform.scale}
+    data |= {"confidence": rendered.confidence, "clipped": rendered.clipped}
     data = {name: values for name, values in data.items() if values is not None}
-    parts = [Part(rgb_channels(hdr) | {"A": rendered.alpha}, header, "rgba"), Part(data, as_data(header), "data")]
+    parts = [picture, Part(data, as_data(picture.header), "data")]
     pixel_type = write_multipart_exr(path, parts, pixel=pixel, overwrite=overwrite)
     if pixel_type != pixel:
         log.info("%s: holds values above 65504, which half cannot; written as float", path.name)
     return path
 
 
-def map_header(
+def map_part(
     run: "RenderableScene",
+    light: np.ndarray,
+    alpha: np.ndarray,
     center: MapCenter,
     transform: WorldTransform,
     axes: str,
-    layout: str,
+    layout: str = "latlong",
     *,
+    name: str = "",
     colorspace: str = "rec709",
     exposure: float = 1.0,
-) -> dict[str, Any]:
-    """Return the OpenEXR attributes of a map: where it was taken, its axes, units and colors.
+    **facts: str,
+) -> Part:
+    """Return the part of a file that shows a map, whose attributes say where it was taken, and its axes and units.
 
-    `transform` leads from the scene's coordinates to those of the file, which `axes` names; radiance was multiplied by
-    `exposure` seconds.
+    `light` is its radiance [H, W, 3] and `alpha` the coverage [H, W]. `transform` leads from the scene's coordinates to
+    those of the file, which `axes` names. `facts` are further text by key; all others are as of PictureHeader.part().
     """
-    facts = {
+    facts |= {
         "position": json.dumps(transform.points(center.position).tolist()),
         "axes": axes,
         "beyond": repr(float(f"{center.beyond * transform.scale:.15g}")),  # As stated, but for rounding
         "mapToWorld": json.dumps(transform.rotation.T.tolist()),
     }
-    header = PictureHeader.of(run, transform, colorspace).attributes(exposure, None, **facts)
-    return header | {"envmap": envmap(layout)}
+    part = PictureHeader.of(run, transform, colorspace).part(light, exposure, None, {"A": alpha}, name, **facts)
+    return replace(part, header={**part.header, "envmap": envmap(layout)})
 
 
 def check_map(path: Path, size: int, layout: str, axes: str, beyond: float | None, pixel: str) -> None:

@@ -18,10 +18,10 @@ from ...scene.wide_camera import typical_focal_length
 from ...subsets import first_names
 from ..cameras.scene_cameras import training_cameras
 from ..images.display import exposure_for_white
-from ..images.exr import rgb_channels, write_exr
+from ..images.exr import write_multipart_exr
 from ..picture_header import provenance
 from ..world_transform import WorldTransform, world_transform
-from .environment_map import COVERED, inpainted_light, latlong, little_visible, map_header, render_map, solid_angles
+from .environment_map import COVERED, inpainted_light, latlong, little_visible, map_part, render_map, solid_angles
 from .map_center import MapCenter, find_center
 from .unit import luminance_of_one
 
@@ -313,8 +313,7 @@ def _write_rest(
         text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"
         log.info(text, path.name, share, 100 * inpainted)
         hdr = hdr + added
-    header = map_header(run, center, transform, axes, "latlong")
-    write_exr(path, rgb_channels(hdr) | {"A": rest.alpha}, header=header, overwrite=overwrite)
+    write_multipart_exr(path, [map_part(run, hdr, rest.alpha, center, transform, axes)], overwrite=overwrite)
     return inpainted
 
 
