@@ -100,7 +100,7 @@ def with_iterations_of(saved: Config, config: Config) -> Config:
     """Return the config of a preset with the iterations of the run that it continues: a preset does not stretch it."""
     before, own = saved.schedule.iterations, config.schedule.iterations
     if own > before:
-        log.info("the run keeps its %d iterations, not the preset's %d; schedule.iterations states more", before, own)
+        log.info("the run keeps its %d iterations, not the preset's %d; schedule.iterations gives it more", before, own)
     return override_config(config, {"schedule.iterations": before})
 
 

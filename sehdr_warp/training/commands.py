@@ -183,7 +183,7 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
     from .advice import advice_on, options_of_run
     from .hdr_truth import check_dataset_truth
     from .process_settings import precompiling
-    from .train import create_trainer
+    from .train import create_trainer, resumed_config
 
     output, out = args.output, args.output.out
     assert out is not None, "run_train() refuses it"
@@ -194,9 +194,9 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
         log.info("%s holds no run yet: a training begins there", out)
     info, saved_config = folder.read_info() if resumes else {}, folder.read_config() if resumes else None
     data, config = _load_arguments(args, info.get("data")), _config(args, saved_config)
+    config = config if saved_config is None else resumed_config(folder, config)
     request = PhotoRequest(data, config.load_options)
     if saved_config is not None:
-        # create_trainer() refuses another --response than that of the run.
         request = request.of_run(saved_config, Response.from_dict(info["response"]), folder.read_cameras())
         request = request if args.scene.holdout is None else replace(request, cameras=())
     check_dataset_truth(data, config)

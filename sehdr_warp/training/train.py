@@ -180,16 +180,10 @@ def _resumed_trainer(
 ) -> Trainer:
     """Create the trainer of a run's newest checkpoint; raise InputError if scene or config are not those of the run.
 
-    More iterations are allowed: they stretch the schedule or, after its end, extend it (Config.continued_after). They
-    are saved in extension.json.
+    More iterations stretch the schedule or, after its end, extend it (Config.continued_after); extension.json has them.
     """
     folder.lock()
-    info, saved = folder.read_info(), folder.read_config()
-    before = saved.schedule.iterations
-    if config is not None:
-        config = _with_decisions(config, saved, folder)
-        saved = override_config(saved, {"schedule.iterations": max(before, config.schedule.iterations)})
-        require_same_config(config, saved, folder.config_file, "resume with the run's own config, or train anew")
+    info, before, config = folder.read_info(), folder.read_config().schedule.iterations, resumed_config(folder, config)
     # The Gaussians are in the world that structure from motion found when the training began.
     cameras = {entry.name: entry.camera for entry in folder.read_cameras()} if scene.format in SFM_LAYOUTS else {}
     unit = Normalization.from_dict(info["normalization"]).unit
@@ -198,12 +192,12 @@ def _resumed_trainer(
     checkpoint = folder.newest_checkpoint()
     if checkpoint is None:
         raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, with --overwrite")
-    field = field_from_checkpoint(checkpoint, saved, info).to(device)
+    field = field_from_checkpoint(checkpoint, config, info).to(device)
     compensation = exposure_compensation(info)
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     large_scene = checkpoint.values.get("large_scene")
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
-    longer = saved.continued_after(finished_at)
+    longer = config.continued_after(finished_at)
     trainer = Trainer(scene, longer, field, ranks=ranks, large_scene=large_scene)
     try:
         load_state(trainer, checkpoint)
@@ -213,7 +207,7 @@ def _resumed_trainer(
     if trainer.total > before:
         folder.extend(trainer.total, finished_at)
         text = "the schedule is stretched from %d to %d iterations: rates and densification are those of the longer one"
-        if longer is not saved:
+        if longer is not config:
             text = (
                 "the finished training goes on from %d to %d iterations: positions learn slowly, no Gaussians are added"
             )
@@ -222,17 +216,24 @@ def _resumed_trainer(
     return trainer
 
 
-def _with_decisions(config: Config, saved: Config, folder: RunWriter) -> Config:
-    """Return a config with the fields that a run's plan decided, as the run has them; fields in plan.keep stay.
+def resumed_config(folder: RunWriter, config: Config | None) -> Config:
+    """Return the config of a run to resume, with the iterations of `config` if these are more.
 
-    On another machine, the same config may be planned differently.
+    Raises InputError if `config` differs otherwise. Fields that the run's plan decided count as the run has them, but
+    for those in plan.keep: on another machine, the same config may be planned differently.
     """
-    if not config.plan.enabled:
-        return config
-    fields = {path: value for decision in folder.read_decisions() for path, value in decision["fields"].items()}
-    fields |= {path: attrgetter(path)(saved) for path, _ in config_fields() if path in fields}
-    decided = {path: value for path, value in fields.items() if path not in config.plan.keep}
-    return override_config(config, decided | {"plan.enabled": False}, folder.plan_file)
+    saved = folder.read_config()
+    if config is None:
+        return saved
+    if config.plan.enabled:
+        fields = {path: value for decision in folder.read_decisions() for path, value in decision["fields"].items()}
+        fields |= {path: attrgetter(path)(saved) for path, _ in config_fields() if path in fields}
+        decided = {path: value for path, value in fields.items() if path not in config.plan.keep}
+        config = override_config(config, decided | {"plan.enabled": False}, folder.plan_file)
+    iterations = max(saved.schedule.iterations, config.schedule.iterations)
+    saved = override_config(saved, {"schedule.iterations": iterations})
+    require_same_config(config, saved, folder.config_file, "resume with the run's own config, or train anew")
+    return saved
 
 
 def _cap_notes(trainer: Trainer) -> Iterator[str]:

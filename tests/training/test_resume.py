@@ -303,9 +303,10 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
             use(run.path)
 
 
-def test_resume_refuses_another_response(photos, tmp_path, capsys):
+def test_resume_refuses_another_response_before_photos_are_read(photos, tmp_path, capsys, monkeypatch):
     words = ["train", photos, "--out", tmp_path / "run", "--device", "cpu"]
     assert call(*words, "--iterations", "1", "--response", "learned") == 0
+    monkeypatch.setattr("sehdr_warp.runs.open.load_scene_and_log_notes", None)
     assert call("train", "--resume", "--out", tmp_path / "run", "--device", "cpu", "--response", "srgb") == 1
     assert "response.name = 'learned', but 'srgb' was asked for" in capsys.readouterr().err
 
