@@ -133,7 +133,7 @@ class PhotoSampler:
 class PhotoStream:
     """A replacement of ViewStack with SLOTS photos on the device.
 
-    Call bring() for a view before at() returns it, and release() once the kernels that read it are launched. [i] is a
+    Call stage() for a view before at() returns it, and release() once the kernels that read it are launched. [i] is a
     copy of view i, with the same values as in ViewStack: steps that are not captured read it.
     """
 
@@ -187,12 +187,12 @@ class PhotoStream:
         return self._cameras.times
 
     def at(self, index: Tensor) -> TrainingView:
-        """Return the view whose number is in index [1], as in ViewStack; bring() must have been called for it."""
+        """Return the view whose number is in index [1], as in ViewStack; stage() must have been called for it."""
         view = self._cameras.at(index)
         parts = {name: select_view(slots, self._slot_index) for name, slots in self._slots.items() if name != "codes"}
         return replace(view, target=replace(view.target, codes=self._slots["codes"], index=self._slot_index, **parts))
 
-    def bring(self, index: int) -> None:
+    def stage(self, index: int) -> None:
         """Make a view available to the kernels that are launched next."""
         self._fetch(index)
         self._current = slot = self._slot_views.index(index)
@@ -204,7 +204,7 @@ class PhotoStream:
         self._slot_index.fill_(slot)
 
     def release(self, next_index: int | None) -> None:
-        """Mark the view of bring() as read by launched kernels, and start to fetch the next one."""
+        """Mark the view of stage() as read by launched kernels, and start to fetch the next one."""
         if self._cuda:
             self._free[self._current].record(torch.cuda.current_stream(self._device))
         if next_index is not None:

@@ -59,11 +59,11 @@ class StepRunner:
             self._reserve_rows(iteration)
         step.prepare(options, iteration)
         key = step.graph_key(views, options)
-        if self.can_replay(views, key) and (capacity := self._capacity.next()) is not None:
+        if self.can_replay(views, key) and (capacity := self._capacity.for_next_step()) is not None:
             return self._replay(views, index, next_index, options, key, capacity, iteration)
         with self.on_capture_stream():  # Without a capacity, so that result.intersections is their number.
             result = step.run(views[index], options)
-        self._capacity.observe(result.intersections)
+        self._capacity.record(result.intersections)
         if key is not None:
             self._eager_keys.add(key)
         return result
@@ -94,7 +94,7 @@ class StepRunner:
         assert graph is not None
         self._index.fill_(index)
         if isinstance(views, PhotoStream):
-            views.bring(index)
+            views.stage(index)
         try:
             if update_graph is None:
                 result = graph.run(key, lambda: step.run(views.at(self._index), options, capacity))
@@ -116,7 +116,7 @@ class StepRunner:
             views.release(next_index)
         return result
 
-    def adapt(self, count: int, reallocations: int, iteration: int) -> None:
+    def after_densification(self, count: int, reallocations: int, iteration: int) -> None:
         """Adapt rows, capacity and graphs after Gaussians were added or removed.
 
         `count` and `reallocations` are those of the Gaussians before.
@@ -166,14 +166,14 @@ class GraphCapacity:
             self._host_counters = torch.zeros(3, dtype=torch.int64, pin_memory=True)
             self._copied = torch.cuda.Event()
 
-    def observe(self, intersections: int) -> None:
+    def record(self, intersections: int) -> None:
         """Record the exact number of intersections of a step that ran without a graph."""
         self._expected = max(self._expected, intersections)
 
-    def next(self) -> int | None:
+    def for_next_step(self) -> int | None:
         """Return the capacity of the next step, the same until poll() or rescale() asks for another; None if unknown.
 
-        It is unknown before the first observe().
+        It is unknown before the first record().
         """
         if self._expected:
             self._capacity = self._capacity or max(MIN_CAPACITY, math.ceil(HEADROOM * self._expected))

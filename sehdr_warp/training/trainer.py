@@ -268,7 +268,7 @@ class Trainer:
         if ranks is not None:
             changed = ranks.broadcast_refined(changed, strategy, gaussians, self.optimizer)
         if changed:
-            self.step_runner.adapt(count, reallocations, self.iteration)
+            self.step_runner.after_densification(count, reallocations, self.iteration)
 
     def _make_seeds(self, number: Tensor, bound: int) -> Seeds:
         """Make new Gaussians where the step's photo is reproduced worst; the same in a resumed training."""

@@ -140,7 +140,7 @@ def test_what_is_brought_is_the_view(device, truth):
     stream, order = PhotoStream(source), [0, 1, 2, 2, 5, 3, 4, 0, 1, 5, 2, 0]
     assert len(stream) == len(source) == len(views)
     for index, following in zip(order, [*order[1:], None], strict=True):
-        stream.bring(index)
+        stream.stage(index)
         streamed, whole = stream.at(torch.tensor([index], device=device)), source[index]
         encoded, mask = streamed.target.encoded, streamed.target.mask
         stream.release(following)

@@ -23,16 +23,16 @@ def replay(capacity, pairs):
     """Recorded steps that need so many pairs each; the capacity that they were given."""
     loss = torch.zeros((), device=capacity.step_counters.device)
     for needed in pairs:
-        fixed_capacity, needed = capacity.next(), torch.tensor(needed, device=loss.device)
+        fixed_capacity, needed = capacity.for_next_step(), torch.tensor(needed, device=loss.device)
         decide_step(loss, loss[None], needed > fixed_capacity, capacity.step_counters, needed)
     return fixed_capacity
 
 
 def test_room_follows_the_most_pairs_seen(device):
     capacity = GraphCapacity(counters(device))
-    assert capacity.next() is None
-    capacity.observe(MANY)
-    assert capacity.next() is not None
+    assert capacity.for_next_step() is None
+    capacity.record(MANY)
+    assert capacity.for_next_step() is not None
     most = MANY * 6 // 5
     assert replay(capacity, [MANY, most, MANY]) == HEADROOM * MANY
     assert capacity.poll() == (0, False)
@@ -46,7 +46,7 @@ def test_room_follows_the_most_pairs_seen(device):
 
 def test_a_lack_of_room_is_noticed_and_mended(device):
     capacity = GraphCapacity(counters(device))
-    capacity.observe(MANY)
+    capacity.record(MANY)
     replay(capacity, [MANY, 5 * MANY, MANY])
     assert int(capacity.step_counters[2]) == 1
     assert capacity.poll() == (0, True)
@@ -56,21 +56,21 @@ def test_a_lack_of_room_is_noticed_and_mended(device):
 
 def test_room_stays_while_it_is_enough(device):
     capacity = GraphCapacity(counters(device))
-    capacity.observe(MANY)
+    capacity.record(MANY)
     fixed_capacity = replay(capacity, [MANY])
-    assert capacity.rescale(1.05, same_memory=True) and capacity.next() == fixed_capacity
+    assert capacity.rescale(1.05, same_memory=True) and capacity.for_next_step() == fixed_capacity
     assert replay(capacity, [MANY * 21 // 20]) == fixed_capacity
     assert capacity.rescale(1.05, same_memory=True)
     replay(capacity, [MANY * 11 // 10])
     assert not capacity.rescale(1.1, same_memory=True)
-    assert capacity.next() == pytest.approx(HEADROOM * 1.1 * 1.1 * MANY, abs=3)
+    assert capacity.for_next_step() == pytest.approx(HEADROOM * 1.1 * 1.1 * MANY, abs=3)
 
 
 def test_looks_that_do_not_wait_tell_what_the_one_before_asked_for(device):
     capacity, nan = GraphCapacity(counters(device)), torch.full((1,), float("nan"), device=device)
-    capacity.observe(MANY)
+    capacity.record(MANY)
     pairs = torch.tensor(5 * MANY, device=device)
-    decide_step(nan[0], nan, pairs > capacity.next(), capacity.step_counters, pairs)
+    decide_step(nan[0], nan, pairs > capacity.for_next_step(), capacity.step_counters, pairs)
     late = [capacity.poll(wait=False) for _ in range(2)]
     assert late[-1 if capacity.step_counters.is_cuda else 0] == (1, True)
     assert int(capacity.step_counters[2]) == 1
@@ -78,7 +78,7 @@ def test_looks_that_do_not_wait_tell_what_the_one_before_asked_for(device):
 
 def test_few_pairs_get_the_least_room(device):
     capacity = GraphCapacity(counters(device))
-    capacity.observe(1)
+    capacity.record(1)
     assert replay(capacity, [1]) == MIN_CAPACITY
 
 
