@@ -40,19 +40,19 @@ class ClientRun:
         self, on_renderer: Callable[[Connection, Callable[[], Any], int], Any], run: ViewerScene, client: Connection
     ):
         """Set the run, and what calls a function on the renderer, see Viewer.on_renderer."""
-        self._on_renderer, self._run, self.client = on_renderer, run, client
+        self._on_renderer, self._run, self._client = on_renderer, run, client
 
     def render(self, camera: Any, *, supersample: bool = True) -> Any:
         """Render a camera, as RenderableScene.render(); its turn comes by the pixels that are averaged."""
         samples = getattr(self._run, "samples_across_pixel", None) if supersample else None  # A training has none.
         factor = 1 if samples is None else samples(camera)
         render = partial(self._run.render, camera, supersample=supersample)
-        return self._on_renderer(self.client, render, factor**2 * camera.width * camera.height)
+        return self._on_renderer(self._client, render, factor**2 * camera.width * camera.height)
 
     def render_confidence(self, camera: Any) -> Any:
         """Render confidence."""
         render = partial(self._run.render_confidence, camera)
-        return self._on_renderer(self.client, render, camera.width * camera.height)
+        return self._on_renderer(self._client, render, camera.width * camera.height)
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the run."""

@@ -47,14 +47,10 @@ class LiveTraining(ViewerScene):
 
     def __getattr__(self, name: str):
         """Return what the viewer reads of a run from the training."""
-        field = self.run.field
+        field, scene = self.run.field, self.run.scene
         attributes = {"response": field.response, "base_time": field.base_time, "gaussian_count": field.gaussians.count}
-        attributes |= {
-            "scene_name": self.run.scene.name,
-            "iterations": self.run.iteration,
-            "cameras": self.run.scene.views,
-        }
-        attributes |= {"color_matrix": self.run.scene.color_matrix, "world_matrix": None, "reference": None, "up": None}
+        attributes |= {"scene_name": scene.name, "iterations": self.run.iteration, "cameras": scene.views}
+        attributes |= {"color_matrix": scene.color_matrix, "world_matrix": None, "reference": None, "up": None}
         if name not in attributes:
             raise AttributeError(name)
         return attributes[name]

@@ -28,6 +28,7 @@ from ..output.images.ldr_files import quantize
 from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
+from ..scene import Camera
 from .clients import ClientRun, Refusal, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, orient
@@ -47,6 +48,7 @@ _HEADERS = {
 }
 _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' blob: data:"
 _LOCAL = ("127.0.0.1", "localhost", "[::1]")
+Answer = tuple[str, bytes | memoryview]  # Content type and content
 
 
 class Viewer:
@@ -67,72 +69,77 @@ class Viewer:
         self._photos, self._photo_lock, self._save_lock = photos, threading.Lock(), threading.Lock()
         self._renderer = Renderer(second_thread=training is None and all(run.on_cpu for run in self.runs))
         self._closed = threading.Event()
+        self._posts = {"/frame": self._frame, "/path": self._path, "/save": self._save}
+        changes = {"/edit": self._edit, "/orientation": self._orient, "/lights": self._lights, "/gain": self._set_gain}
+        self._posts |= changes if training is None else {"/training": self._control}
         page = Path(__file__).parent / "page"
-        self.files = {
-            "/": ("text/html", page.joinpath("viewer.html").read_text(encoding="utf-8")),
-            "/viewer.css": ("text/css", page_file("style.css") + (page / "viewer.css").read_text(encoding="utf-8")),
-            **{f"/{name}": ("text/javascript", page_file(name)) for name in ("tables.js", "light.js", "camera.js")},
-            "/viewer.js": ("text/javascript", page.joinpath("viewer.js").read_text(encoding="utf-8")),
-        }
+        html, css, script = (
+            page.joinpath(f"viewer.{kind}").read_text(encoding="utf-8") for kind in ("html", "css", "js")
+        )
+        scripts = {name: page_file(name) for name in ("tables.js", "light.js", "camera.js")} | {"viewer.js": script}
+        self.files = {"/": ("text/html", html), "/viewer.css": ("text/css", page_file("style.css") + css)}
+        self.files |= {f"/{name}": ("text/javascript", text) for name, text in scripts.items()}
 
-    def get(self, path: str, client: Connection) -> tuple[str, bytes]:
-        """Answer a GET: content type and content; raise Refusal."""
+    def get(self, path: str, client: Connection) -> Answer:
+        """Answer a GET; raise Refusal."""
         if path in self.files:
             kind, text = self.files[path]
             return f"{kind}; charset=utf-8", text.encode()
         if path == "/scene":
-            facts = {"runs": [run.facts() for run in self.runs], "training": self.training is not None}
-            return "application/json", json.dumps(facts).encode()
+            return _json({"runs": [run.facts() for run in self.runs], "training": self.training is not None})
         if path == "/versions":
-            return "application/json", json.dumps([run.version for run in self.runs]).encode()
+            return _json([run.version for run in self.runs])
         if path == "/training" and self.training is not None:
-            return "application/json", json.dumps(self.training.progress()).encode()
+            return _json(self.training.progress())
         if path == "/saving":
             return "text/plain", self.save_line.encode()
         if path.startswith("/photo/"):
             return "image/png", self._photo(path.removeprefix("/photo/"), client)
         raise Refusal(404, "no such page")
 
-    def post(self, path: str, request: dict, client: Connection) -> tuple[str, bytes | memoryview]:
-        """Answer a POST: content type and content; raise Refusal, or the error of a bad request."""
-        if path == "/training" and self.training is not None:
-            self.training.control(str(request["do"]))
-            return "application/json", b"{}"
-        if path == "/frame":
-            options = {name: bool(request.get(name)) for name in ("draft", "clipped")}
-            run, camera = self._run_of(request), camera_of(request["camera"])
-            client.reserve(frame_bytes(camera, options["clipped"]))
-            parts, pixels, frame = run.frame_parts(camera, **options), camera.width * camera.height, None
-            while frame is None:
-                frame = self.on_renderer(client, partial(next, parts), pixels)
-            return "application/octet-stream", frame
-        if path in ("/edit", "/orientation") and self.training is None:
-            run = self._run_of(request)
-            if path == "/edit":
-                edits = edits_of(request, partial(self._photos_of, int(request.get("run", 0))))
-                merged = [self._run_of({"run": index}) for index in request.get("merge", ())]
-                self.on_renderer(client, partial(run.edit, edits, merged))
-            else:
-                self.on_renderer(client, partial(orient, run, request))
-            run.version += 1  # Pages read up and scale again.
-            return "application/json", json.dumps(run.facts()).encode()
-        if path in ("/lights", "/gain") and self.training is None:
-            run = self._run_of(request)
-            if path == "/gain":
-                light, stops = int(request["light"]), float(request["stops"])
-                self.on_renderer(client, partial(run.set_gain, light, stops))
-            return "application/json", json.dumps(self.on_renderer(client, run.describe_lights)).encode()
-        if path in ("/path", "/save"):
-            cameras = [camera_of(camera) for camera in request["cameras"][:MOST_VIEWS]]
-            if not cameras:
-                raise Refusal(400, "the request has no cameras")
-            if request.get("count"):
-                cameras = interpolate(cameras, min(int(request["count"]), MOST_VIEWS))
-            if path == "/path":
-                return "application/json", camera_file(self._run_of(request), cameras).encode()
-            client_run = ClientRun(self.on_renderer, self._run_of(request), client)
-            return self._save(client_run, cameras, str(request["kind"]), request)
-        raise Refusal(404, "no such page")
+    def post(self, path: str, request: dict, client: Connection) -> Answer:
+        """Answer a POST; raise Refusal, or the error of a bad request."""
+        if path not in self._posts:
+            raise Refusal(404, "no such page")
+        return self._posts[path](request, client)
+
+    def _control(self, request: dict, client: Connection) -> Answer:
+        return _json(self.training.control(str(request["do"])) or {})
+
+    def _frame(self, request: dict, client: Connection) -> Answer:
+        options = {name: bool(request.get(name)) for name in ("draft", "clipped")}
+        run, camera = self._run_of(request), camera_of(request["camera"])
+        client.reserve(frame_bytes(camera, options["clipped"]))
+        parts, pixels, frame = run.frame_parts(camera, **options), camera.width * camera.height, None
+        while frame is None:
+            frame = self.on_renderer(client, partial(next, parts), pixels)
+        return "application/octet-stream", frame
+
+    def _edit(self, request: dict, client: Connection) -> Answer:
+        edits = edits_of(request, partial(self._photos_of, int(request.get("run", 0))))
+        merged = [self._run_of({"run": index}) for index in request.get("merge", ())]
+        return self._change(request, client, lambda run: run.edit(edits, merged))
+
+    def _orient(self, request: dict, client: Connection) -> Answer:
+        return self._change(request, client, partial(orient, request=request))
+
+    def _change(self, request: dict, client: Connection, change: Callable[[ViewerScene], None]) -> Answer:
+        """Change a run on the renderer's thread, and answer with its facts."""
+        run = self._run_of(request)
+        self.on_renderer(client, partial(change, run))
+        run.version += 1  # Pages read up and scale again.
+        return _json(run.facts())
+
+    def _lights(self, request: dict, client: Connection) -> Answer:
+        return _json(self.on_renderer(client, self._run_of(request).describe_lights))
+
+    def _set_gain(self, request: dict, client: Connection) -> Answer:
+        light, stops = int(request["light"]), float(request["stops"])
+        self.on_renderer(client, partial(self._run_of(request).set_gain, light, stops))
+        return self._lights(request, client)
+
+    def _path(self, request: dict, client: Connection) -> Answer:
+        return "application/json", camera_file(self._run_of(request), _cameras_of(request)).encode()
 
     def close(self) -> None:
         """End the work for clients, and wait for it: native code must not run while Python ends."""
@@ -143,10 +150,7 @@ class Viewer:
                 lock.release()
 
     def on_renderer(self, client: Connection, make: Callable[[], Any], pixels: int = 0) -> Any:
-        """Return what `make` returns on the thread of the renderer, unless its client has gone by then.
-
-        pixels: Of the picture, by which others go first.
-        """
+        """Return what `make` returns on the renderer's thread, if its client is still there; fewer pixels go first."""
 
         def call() -> Any:
             if self._closed.is_set() or client.is_closed():
@@ -189,9 +193,12 @@ class Viewer:
         client.reserve(buffer.tell())
         return buffer.getvalue()
 
-    def _save(self, run: Any, cameras: Sequence, kind: str, request: dict) -> tuple[str, bytes]:
-        """Return the type and content of what a client saves: EXR, a zip of what `render` writes, a film or a page."""
-        stops = _stops(request)
+    def _save(self, request: dict, client: Connection) -> Answer:
+        """Return what a client saves: EXR, a zip of what `render` writes, a film or a page."""
+        cameras, kind, stops = _cameras_of(request), str(request["kind"]), float(request.get("stops") or 0)
+        run: Any = ClientRun(self.on_renderer, self._run_of(request), client)
+        if not abs(stops) <= MOST_STOPS:  # NaN is not.
+            raise Refusal(400, f"stops {stops} are not between -{MOST_STOPS:g} and {MOST_STOPS:g}")
         evs = str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
         pictures = len(evs.split(",")) + 1 if evs else 1
         pixels = pictures * sum(camera.width * camera.height for camera in cameras)
@@ -202,7 +209,7 @@ class Viewer:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 if kind == "page":
-                    page = self.on_renderer(run.client, partial(write_scene_page, run, Path(folder, "scene.html")))
+                    page = self.on_renderer(client, partial(write_scene_page, run, Path(folder, "scene.html")))
                     return "text/html", page.read_bytes()
                 if kind == "film":
                     options = {"ev_ramp": (stops, stops), "exposed": True, "tell": self._tell}
@@ -217,7 +224,7 @@ class Viewer:
                     for file in files:
                         archive.write(file, file.relative_to(folder))
                         file.unlink()
-                run.client.reserve(packed.stat().st_size)
+                client.reserve(packed.stat().st_size)
                 return "application/zip", packed.read_bytes()
         finally:
             self.save_line = ""
@@ -228,11 +235,16 @@ class Viewer:
         self.save_line = line
 
 
-def _stops(request: dict) -> float:
-    stops = float(request.get("stops") or 0)
-    if not abs(stops) <= MOST_STOPS:  # NaN is not.
-        raise Refusal(400, f"stops {stops} are not between -{MOST_STOPS:g} and {MOST_STOPS:g}")
-    return stops
+def _json(value: Any) -> Answer:
+    return "application/json", json.dumps(value).encode()
+
+
+def _cameras_of(request: dict) -> list[Camera]:
+    """Return the cameras of a request, or as many between them as it counts; raise Refusal without one."""
+    cameras = [camera_of(camera) for camera in request["cameras"][:MOST_VIEWS]]
+    if not cameras:
+        raise Refusal(400, "the request has no cameras")
+    return interpolate(cameras, min(int(request["count"]), MOST_VIEWS)) if request.get("count") else cameras
 
 
 class Server(ThreadingHTTPServer):
@@ -328,7 +340,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise Refusal(400, "a request is an object")
         return values
 
-    def _answer(self, find: Callable[[str, Connection], tuple[str, bytes | memoryview]]) -> None:
+    def _answer(self, find: Callable[[str, Connection], Answer]) -> None:
         connections = self.server.connections
         try:
             connection = connections.of(self.connection)
@@ -339,7 +351,7 @@ class _Handler(BaseHTTPRequestHandler):
             answer = self._result_of(partial(find, own_path(self.path), connection))
             self._send(connection, *answer)
 
-    def _result_of(self, find: Callable[[], tuple[str, bytes | memoryview]]) -> tuple[int, str, bytes | memoryview]:
+    def _result_of(self, find: Callable[[], Answer]) -> tuple[int, str, bytes | memoryview]:
         """Return status, content type and content of an answer."""
         try:
             if not self.server.allowed(self.headers.get("Host", ""), self.headers.get("Origin")):
