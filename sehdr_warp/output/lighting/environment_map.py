@@ -10,9 +10,8 @@ import numpy as np
 
 from ...errors import SehdrError, refuse_paths
 from ...files import check_absent
-from ...scene import Camera
 from ...scene.wide_camera import typical_focal_length
-from ..cameras.scene_cameras import training_cameras
+from ..cameras.scene_cameras import camera_positions, training_cameras
 from ..images.colorspace import color_space, from_rec709
 from ..images.display import exposure_for_white
 from ..images.exr import Part, as_data, write_multipart_exr, write_radiance
@@ -108,12 +107,12 @@ def write_environment_map(
     exposure = exposure_for_white(run, reference_white)
     check_absent(path, overwrite)
     photos = training_cameras(run)
-    center = find_center(run, photos, at, beyond, transform)
+    center = find_center(run, at, beyond, transform)
     focal = typical_focal_length(photos) if photos else 0.0
     what = {"beyond": center.beyond, "shares": run.clipped_share()}
     rendered = render_map(run, center.position, size, layout, transform.rotation, focal, **what)
-    weight, place = solid_angles(size, layout), transform.points(center.position)
-    _judge(run, center, place, photos, rendered.alpha, rendered.distance, weight)
+    weight = solid_angles(size, layout)
+    _judge(run, center, transform.points(center.position), rendered, weight)
     added = np.zeros_like(rendered.hdr)
     if inpaint:
         directions = map_directions(size, layout) @ transform.rotation
@@ -356,26 +355,20 @@ def _place(point: np.ndarray) -> str:
 
 
 def _judge(
-    run: "RenderableScene",
-    center: MapCenter,
-    point: np.ndarray,
-    photos: list[Camera],
-    alpha: np.ndarray,
-    distance: np.ndarray,
-    weight: np.ndarray,
+    run: "RenderableScene", center: MapCenter, point: np.ndarray, rendered: RenderedMap, weight: np.ndarray
 ) -> None:
     """Warn about a point from which little, or only near things, are visible; raise SehdrError if nothing is.
 
-    `point` [3] is the center as `--at` takes it, for messages. The spread of the photos' cameras says what is near.
-    `alpha`, `distance` (scene units) and `weight` (solid angles) are those of the map's pixels, [H, W].
+    `point` [3] is the center as `--at` takes it, for messages. `weight` [H, W] is the solid angle of each pixel.
     """
-    share, place = float(weight[alpha > COVERED].sum() / weight.sum()), _place(point)
+    covered, positions = rendered.alpha > COVERED, camera_positions(training_cameras(run))
+    share, place = float(weight[covered].sum() / weight.sum()), _place(point)
     if problem := little_visible(run, center, point, share):
         if share < LEAST_VISIBLE:
             raise SehdrError(problem)
         log.warning("%s", problem)
-    spread = np.linalg.norm(np.ptp([camera.position for camera in photos], axis=0)) if len(photos) > 1 else 0.0
-    near = weight[(alpha > COVERED) & (distance < _NEAR * spread)].sum() / weight.sum()
+    spread = np.linalg.norm(np.ptp(positions, axis=0)) if len(positions) > 1 else 0.0
+    near = weight[covered & (rendered.distance < _NEAR * spread)].sum() / weight.sum()
     if near > 0.5:
         text = "from (%s) %.0f %% of all directions are blocked at once: is it inside of something?"
         log.warning(text, place, 100 * near)

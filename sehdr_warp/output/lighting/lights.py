@@ -126,7 +126,7 @@ def write_lights(
     if suffix == ".json" and unseen != "inpaint":
         raise SehdrError(f"{path}: unseen is for the map of a dome light, and .json has none; write .usda")
     transform = world_transform(run, axes, up=up, scale=scale)
-    center = find_center(run, training_cameras(run), at, beyond, transform)
+    center = find_center(run, at, beyond, transform)
     factor, unit = exposure_for_white(run, reference_white), "relative radiance"
     if reference_white is not None:
         unit = f"white is {reference_white:g}"

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...errors import SehdrError
 from ...scene import Camera
-from ..cameras.scene_cameras import camera_named, common_focus
+from ..cameras.scene_cameras import camera_named, common_focus, training_cameras
 from ..world_transform import WorldTransform
 
 if TYPE_CHECKING:
@@ -41,15 +41,11 @@ def map_center(photos: list[Camera]) -> MapCenter:
 
 
 def find_center(
-    run: "RenderableScene",
-    photos: list[Camera],
-    at: str | tuple[float, float, float],
-    beyond: float | None,
-    transform: WorldTransform,
+    run: "RenderableScene", at: str | tuple[float, float, float], beyond: float | None, transform: WorldTransform
 ) -> MapCenter:
     """Return where a map is rendered and what it leaves out, by the arguments of write_environment_map()."""
     if isinstance(at, str) and at == "center":
-        center = map_center(photos)
+        center = map_center(training_cameras(run))
     elif isinstance(at, str) and at.startswith("camera:"):
         center = MapCenter(camera_named(run, at.removeprefix("camera:")).position, 0.0)
     else:
