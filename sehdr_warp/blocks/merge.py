@@ -107,9 +107,7 @@ def _trained_block(out: Path, plan: BlockPlan, index: int) -> TrainedBlock:
     """Read what the merged run takes from a block."""
     folder = RunFolder(folder_of(out, plan, index))
     folder.require()
-    checkpoint = folder.newest_checkpoint(RENDER_TENSORS)
-    if checkpoint is None:
-        raise InputError(folder.checkpoints, "holds no complete checkpoint", "continue with --resume")
+    checkpoint = folder.newest_checkpoint(RENDER_TENSORS, "continue with --resume")
     info = folder.read_info()
     if info["base_time"] != plan.shared.base_time:
         problem = f"base_time = {info['base_time']}, and the blocks share {plan.shared.base_time}"

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import InputError, SehdrError
+from ..errors import SehdrError
 from ..model.baking import field_of
 from ..model.color_models import rec709_of
 from ..model.confidence import Evidence, gather_evidence
@@ -300,8 +300,6 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
     folder.require()
     info, config = folder.read_info(), folder.read_config()
     checkpoint = folder.newest_checkpoint(RENDER_TENSORS)
-    if checkpoint is None:
-        raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, or continue with --resume")
     field, clipped = field_from_checkpoint(checkpoint, config, info).requires_grad_(False), None
     if (evidence := folder.read_evidence(checkpoint)) is not None:
         field.confidence, clipped, field.clipped_stops = evidence.confidence(), evidence.clipped, evidence.clipped_stops

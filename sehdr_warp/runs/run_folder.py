@@ -55,6 +55,7 @@ from .values import (
 
 NEW, READY = ".new", ".ready"  # A new run while it is written, and while its files take their places
 _GIVE_RUN = "give the folder that a training wrote"
+_TRAIN_AGAIN = "train again, with --overwrite"
 _REMOVE_FILE = "remove this file, which a run does not need, or train again"
 _MAKE_AGAIN = "remove this file; `sehdr-warp report` makes it again from the photos"
 EVIDENCE_TENSORS = {"weight_sum": "seen"} | {name: name for name in ("stops", "clipped", "peak", "clipped_stops")}
@@ -226,15 +227,16 @@ class RunFolder:
             return []
         return list(read_metrics_lines(self._no_link(self.metrics)))
 
-    def newest_checkpoint(self, parts: tuple[str, ...] = ("",)) -> Checkpoint | None:
-        """Return the newest sound checkpoint, None if there is none at all.
+    def newest_checkpoint(self, parts: tuple[str, ...] = ("",), remedy: str = _TRAIN_AGAIN) -> Checkpoint:
+        """Return the newest sound checkpoint.
 
         Args:
             parts: Beginnings of the names of the tensors to read, as in read_checkpoint().
+            remedy: What to do if there is none at all.
 
         Raises:
-            InputError: of the newest, if all are damaged or hold numbers that are not finite; or if a file that
-                decides the picture was changed since the checkpoint was written.
+            InputError: if there is none; of the newest, if all are damaged or hold numbers that are not finite; or if a
+                file that decides the picture was changed since the checkpoint was written.
         """
         newest: InputError | None = None
         for path in reversed(folders := self._checkpoint_folders()):
@@ -251,9 +253,7 @@ class RunFolder:
             return checkpoint
         if folders != self._checkpoint_folders():  # A running training has written another and removed these.
             return self.newest_checkpoint(parts)
-        if newest is not None:
-            raise newest
-        return None
+        raise newest or InputError(self.checkpoints, "holds no complete checkpoint", remedy)
 
     def read_evidence(self, checkpoint: Checkpoint) -> Evidence | None:
         """Return the evidence of the training photos for a checkpoint's Gaussians; None if there is none for it."""

@@ -190,8 +190,6 @@ def _resumed_trainer(
     scene = in_world_of_run(scene, cameras, unit, folder.path, scene.name)
     folder.check_same_scene(scene)
     checkpoint = folder.newest_checkpoint()
-    if checkpoint is None:
-        raise InputError(folder.checkpoints, "holds no complete checkpoint", "train again, with --overwrite")
     field = field_from_checkpoint(checkpoint, config, info).to(device)
     compensation = exposure_compensation(info)
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)

@@ -40,7 +40,7 @@ RUNS = {
     ),
     "no checkpoint": (
         lambda run: shutil.rmtree(run / "checkpoints"),
-        "checkpoints: holds no complete checkpoint; train again, or continue with --resume",
+        "checkpoints: holds no complete checkpoint; train again, with --overwrite",
     ),
     "tensor missing": (
         lambda run: resign(run, lambda tensors: tensors.pop("gaussians.means")),
