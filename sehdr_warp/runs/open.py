@@ -195,11 +195,16 @@ def in_world_of_run(
 
 
 def load_run_scene_with_confidence(run: Run, data: str | None) -> Scene:
-    """Load the photos of a run as load_run_scene does, and measure the run's confidence if it has none."""
-    from .run import ensure_confidence
+    """Load the photos of a run as load_run_scene does, and measure and save the run's confidence if it has none."""
+    from .run_writer import write_confidence
 
     scene = load_run_scene(run, data)
-    ensure_confidence(run, scene)
+    if run.field.confidence is None and scene.train_views:
+        evidence = run.measure_confidence(scene)
+        try:
+            write_confidence(run.folder, evidence, run.checkpoint_hash)
+        except SehdrError as error:
+            log.warning("the confidence was not saved: %s", error)
     return scene
 
 

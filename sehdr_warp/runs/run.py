@@ -29,7 +29,6 @@ from .device import pick_device
 from .field import field_from_checkpoint
 from .light_estimates import light_estimates
 from .run_folder import CameraEntry, RunFolder
-from .run_writer import write_confidence
 from .values import LoadArguments
 
 log = logging.getLogger(__name__)
@@ -329,14 +328,3 @@ def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, field: Radiance
 def exposure_compensation(info: dict) -> ExposureCompensation | None:
     """Return the exposure compensation that run.json contains, if any."""
     return ExposureCompensation.from_dict(fields) if (fields := info.get("exposure_compensation")) else None
-
-
-def ensure_confidence(run: Run, scene: Scene) -> None:
-    """Measure the confidence of a run that has none, and save it if the folder can be written to."""
-    if run.field.confidence is not None or not scene.train_views:
-        return
-    evidence = run.measure_confidence(scene)
-    try:
-        write_confidence(run.folder, evidence, run.checkpoint_hash)
-    except SehdrError as error:
-        log.warning("the confidence was not saved: %s", error)

@@ -11,8 +11,9 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.runs import open as opening
 from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.runs.run import ensure_confidence, load_run
+from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import confidence_metadata
 from sehdr_warp.scene import codes_of
 from sehdr_warp.training.train import train
@@ -48,17 +49,18 @@ def test_a_summary_states_which_share_of_the_light_is_an_estimate(scene, tmp_pat
     assert least <= run.summary()["estimated_light"] <= most
 
 
-def test_a_run_without_it_gets_it_on_demand(run, scene, caplog):
+def test_a_run_without_it_gets_it_on_demand(run, scene, caplog, monkeypatch):
+    monkeypatch.setattr(opening, "load_run_scene", lambda *_: scene)
     expected = run.field.confidence
     run.folder.confidence.unlink()
     run = load_run(run.path)
     assert run.field.confidence is None and run.render_confidence(scene.test_views[0].camera) is None
     caplog.set_level("INFO")
-    ensure_confidence(run, scene)
+    opening.load_run_scene_with_confidence(run, None)
     torch.testing.assert_close(run.field.confidence, expected)
     torch.testing.assert_close(load_run(run.path).field.confidence, expected)
     assert torch.equal(run.clipped_share(), load_run(run.path).clipped_share())
-    ensure_confidence(run, scene)
+    opening.load_run_scene_with_confidence(run, None)
     assert caplog.text.count("measuring confidence") == 1
 
 
