@@ -7,6 +7,7 @@ import itertools
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ _log = logging.getLogger("sehdr_warp.scene")
 FEATURES = 512  # The largest ones of each photo, of 4,000 to 10,000
 PARTNERS = 12  # Photos that each one is matched with at least, unless they share nothing at all
 MOST_GUIDED = 1000  # Pairs of unplaced photos, along epipolar lines: 2 to 4 times the points, 2.7 times the time
+_SURE, _MOST_TURNED = 60, 0.8  # Matches of a sure pair; part of such pairs that a turn explains: 0.8 to 1, else to 0.3
+_NEAR = 0.5  # Extent of cameras over their distance from the points; 0.2 to 0.4 of cameras that only turned
 RATIO = 0.8  # Largest ratio of the angles to the best and to the second best match, as COLMAP has it
 
 
@@ -80,3 +83,26 @@ def _match_count(first: np.ndarray, second: np.ndarray) -> int:
     np.put_along_axis(rows, partners, -1.0, 1)
     angle, next_angle = (np.arccos(np.clip(cosine, -1, 1)) for cosine in (best, rows.max(1, initial=-1.0)))
     return int((angle < RATIO * next_angle).sum())
+
+
+def from_one_place(database: Path, model: Any = None) -> bool:
+    """Return whether a camera that only turned on the spot explains most pairs of matched photos.
+
+    A flat scene has such pairs, too: the cameras of a `model`, a pycolmap.Reconstruction, must also be nearer to each
+    other than to its points.
+    """
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        geometries = opened.read_two_view_geometries()[1]
+    turned = int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC)
+    sure = [geometry.config == turned for geometry in geometries if len(geometry.inlier_matches) >= _SURE]
+    if not sure or np.mean(sure) < _MOST_TURNED:
+        return False
+    if model is None:
+        return True
+    places = np.array([model.images[i].projection_center() for i in model.reg_image_ids()])
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    center = places.mean(axis=0)
+    spread, distance = (np.linalg.norm(each - center, axis=1) for each in (places, points))
+    return len(points) > 0 and bool(2 * spread.max() < _NEAR * np.median(distance))

@@ -33,7 +33,7 @@ from ..masks import write_reduced
 from ..photo_names import photo_labels
 from ..photos import BRIGHTENING, brightened_codes, read_photo, unusable_notes
 from ..readers.colmap_model import SparseModel, read_model
-from .pairs import FEATURES, MOST_GUIDED, PARTNERS, RATIO, likely_pairs, pairs_with, remove_matches
+from .pairs import FEATURES, MOST_GUIDED, PARTNERS, RATIO, from_one_place, likely_pairs, pairs_with, remove_matches
 from .progress import counted_rows
 
 _log = logging.getLogger("sehdr_warp.scene")
@@ -57,6 +57,7 @@ class Reconstruction:
     model: SparseModel  # Cameras, poses and points; `00003.png` is photos[3], photos not placed are missing
     error: float  # Mean reprojection error in pixels, at photos of at most MAX_SIDE pixels
     weak: tuple[int, ...]  # Indices of the photos that share fewer than FEWEST_SHARED points with others
+    one_place: bool = False  # See from_one_place()
 
     @property
     def sure(self) -> int:
@@ -69,17 +70,18 @@ class Reconstruction:
         unregistered, notes = [i for i in range(len(photos)) if i not in registered], []
         names = photo_labels(photos)
         if unregistered:
-            were = f"could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out"
-            advice = "photos between these and the others help"
-            notes.append(
-                f"{len(unregistered)} of {len(photos)} photos {were}: {all_names(names, unregistered)}; {advice}"
-            )
+            were = f"photos could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out"
+            count, lost = f"{len(unregistered)} of {len(photos)}", all_names(names, unregistered)
+            notes.append(f"{count} {were}: {lost}; photos between these and the others help")
         if self.weak:
             shared = "few points with others, so"
-            few = f"photo shares {shared} its place is", f"photos share {shared} their places are"
-            notes.append(
-                f"{counted(len(self.weak), *few)} uncertain: {all_names(names, self.weak)}; more photos in between help"
+            few = counted(
+                len(self.weak), f"photo shares {shared} its place is", f"photos share {shared} their places are"
             )
+            notes.append(f"{few} uncertain: {all_names(names, self.weak)}; more photos in between help")
+        if self.one_place:
+            turned = "the photos match as if the camera only turned on the spot, which shows no depth"
+            notes.append(f"{turned}: views from elsewhere will be wrong; take photos from different places")
         if self.error > MOST_ERROR:
             notes.append(
                 f"the cameras' places are uncertain: points miss their photos by {self.error:.1f} pixels in the mean; "
@@ -137,14 +139,15 @@ def reconstruct(
         model.write_binary(result)
         placed = [model.images[i] for i in model.reg_image_ids()]
         weak = sorted(int(Path(image.name).stem) for image in placed if image.num_points3D < FEWEST_SHARED)
-        facts = {"sizes": sizes, "error": float(model.compute_mean_reprojection_error()), "weak": weak}
+        facts = {"sizes": sizes, "weak": weak, "one_place": from_one_place(database, model)}
+        facts["error"] = float(model.compute_mean_reprojection_error())
         (result / "facts.json").write_text(json.dumps(facts))
 
     folder = solved_folder(cache, key, solve)
-    model, facts = read_model(folder), json.loads((folder / "facts.json").read_text())
-    sizes = [facts["sizes"][int(Path(image.name).stem)] for image in model.images]
-    images = [replace(image, lens=image.lens.resized(*size)) for image, size in zip(model.images, sizes, strict=True)]
-    return Reconstruction(SparseModel(tuple(images), model.cloud), facts["error"], tuple(facts["weak"]))
+    model, facts = read_model(folder), {"one_place": False} | json.loads((folder / "facts.json").read_text())
+    sized = zip(model.images, (facts["sizes"][int(Path(image.name).stem)] for image in model.images), strict=True)
+    images = tuple(replace(image, lens=image.lens.resized(*size)) for image, size in sized)
+    return Reconstruction(replace(model, images=images), facts["error"], tuple(facts["weak"]), facts["one_place"])
 
 
 def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Path], None]) -> Path:
@@ -374,6 +377,9 @@ def run_mapper(
     if best is None or placed(best) < 2:
         remedy = "take sharp, bright photos that overlap by two thirds" if views == 1 else "take them closer together"
         problem = f"none of the {count} {name}s could be placed by structure from motion"
+        if views == 1 and from_one_place(database):
+            problem += ": they match as if taken from one place"
+            remedy = "take them from different places, as one place shows no depth"
         raise InputError(source, problem, f"{remedy}, or bring poses")
     return best
 

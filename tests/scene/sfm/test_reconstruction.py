@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.color.primaries import linear_to_srgb, srgb_to_linear
@@ -23,7 +24,8 @@ from sehdr_warp.scene.sfm import reconstruction as sfm
 from sehdr_warp.scene.sfm.reconstruction import MOST_ERROR, Reconstruction, image_name, reconstruct
 from tests.make_scenes import arc_poses, load
 
-WITHOUT_EFFECT = {"MOST_ERROR", "_PAIR_COST", "_PLACE_COST"}  # Of a message and of estimates of time
+# Of messages and of estimates of time
+WITHOUT_EFFECT = {"MOST_ERROR", "_SURE", "_MOST_TURNED", "_NEAR", "_PAIR_COST", "_PLACE_COST"}
 CONSTANTS = {
     name
     for module in (pairs, sfm)
@@ -129,7 +131,7 @@ def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, castle_photos, 
     assert min(correlations) > 0.45 and np.mean(correlations) > 0.7  # With the next camera 0.37 and 0.18
     caplog.clear()
     again = load(shutil.copytree(castle_photos, tmp_path / "moved"), max_size=100)
-    assert "cached" in caplog.messages[0]
+    assert "using the cached result" in caplog.text
     np.testing.assert_array_equal(again.points, scene.points)
     assert not list(Path(os.environ["SEHDR_CACHE"]).glob("sehdr-sfm-*"))
 
@@ -305,3 +307,23 @@ def test_poor_placement_is_named_with_its_photos():
     assert "7 of 8 photos could not be placed and were left out: 1.jpg to 7.jpg;" in lost
     _, weak, _ = Reconstruction(model, 1.4, (3,)).notes(photos)
     assert weak.startswith("1 photo shares few points with others, so its place is uncertain: 3.jpg;")
+
+
+@pytest.mark.parametrize("step", [0.0, 8.0])
+def test_photos_from_one_place_are_told(tmp_path, step):
+    """A camera that stands still is not placed; one that turns is, at places that mean nothing."""
+    noise = np.random.default_rng(0).uniform(0, 255, (80, 160)).astype(np.uint8)
+    wall = Image.fromarray(noise).resize((1600, 800), Image.Resampling.BICUBIC)
+    inverse = np.linalg.inv([[400.0, 0, 200], [0, 400.0, 150], [0, 0, 1]])
+    for index in range(6):
+        turn = Rotation.from_euler("y", step * (index - 2.5), degrees=True).as_matrix()
+        pixels = np.array([[400.0, 0, 800], [0, 400.0, 400], [0, 0, 1]]) @ turn @ inverse
+        photo = wall.transform((400, 300), Image.Transform.PERSPECTIVE, (pixels / pixels[2, 2]).ravel()[:8])
+        codes = np.asarray(photo) + np.random.default_rng(index).normal(0, 2, (300, 400))
+        Image.fromarray(codes.clip(0, 255).astype(np.uint8)).save(tmp_path / f"{index}.png")
+    photos = sorted(tmp_path.glob("*.png"))
+    try:
+        told = reconstruct(photos, tmp_path / "cache").notes(photos)[-1]
+    except InputError as error:
+        told = str(error)
+    assert ("as if the camera only turned" if step else "as if taken from one place") in told
