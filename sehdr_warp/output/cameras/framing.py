@@ -90,7 +90,7 @@ def subject_radius(run: "RenderableScene", photos: Sequence[Camera], focus: np.n
     distances = []
     reach = _REACH * float(np.median([np.linalg.norm(camera.position - focus) for camera in photos]))
     for camera in evenly(photos, _VIEWS):
-        points = visible_surface(run, camera.within(SMALL))
+        points, _ = visible_surface(run, camera.within(SMALL))
         offsets = np.linalg.norm(points - focus, axis=1)
         distances.append(offsets[offsets < reach])
     radii = np.concatenate(distances)
@@ -159,9 +159,9 @@ def _focus_distance(run: "RenderableScene", cameras: Sequence[Camera]) -> float:
     return float(np.median(depth)) if depth.size else 1.0
 
 
-def visible_surface(run: "RenderableScene", camera: Camera) -> np.ndarray:
-    """Return points [N, 3] of the surface that a camera shows."""
+def visible_surface(run: "RenderableScene", camera: Camera, least_alpha: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    """Return points [N, 3] of the surface that a camera shows, and their radiance [N, 3]."""
     rendered = run.render(camera, supersample=False)
     depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
-    row, column = np.nonzero((depth > 0) & (alpha > 0.5))
-    return camera.unproject(column + 0.5, row + 0.5, depth[row, column])
+    row, column = np.nonzero((depth > 0) & (alpha > least_alpha))
+    return camera.unproject(column + 0.5, row + 0.5, depth[row, column]), rendered.hdr.cpu().numpy()[row, column]

@@ -160,7 +160,7 @@ def _opening_of(
 
 def _visible_share(run: "RenderableScene", camera: Camera, witnesses: Sequence[Camera]) -> float:
     """Return the share of a picture whose surface several other cameras have in their pictures."""
-    points = visible_surface(run, camera)
+    points, _ = visible_surface(run, camera)
     if not len(points):
         return 0.0
     counts = np.sum([witness.project(points).inside for witness in witnesses], axis=0)

@@ -11,6 +11,7 @@ from PIL import Image
 
 from ...scene import Camera
 from ...subsets import evenly
+from ..cameras.framing import visible_surface
 from ..cameras.scene_cameras import camera_positions, split_or_all
 from ..html import EMPTY, join, markup
 from ..images.ldr_files import quantize
@@ -116,18 +117,11 @@ def _visible_points(cameras: Sequence[Camera], run: "RenderableScene", up: np.nd
     What lies higher than the cameras, such as a ceiling, is left out.
     """
     views = evenly(cameras, _MAP_VIEWS)
-    ceiling, points, colors = max(float(camera.position @ up) for camera in views), [], []
-    for camera in views:
-        small = camera.resized(_SAMPLES, max(1, round(_SAMPLES * camera.height / camera.width)))
-        rendered = run.render(small, supersample=False)  # Points alone are read from it.
-        depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
-        row, column = np.nonzero((depth > 0) & (alpha > 0.9))
-        points.append(small.unproject(column + 0.5, row + 0.5, depth[row, column]))
-        colors.append(rendered.hdr.cpu().numpy()[row, column])
-    all_points, light = np.concatenate(points), np.concatenate(colors)
-    below = all_points @ up < ceiling
-    order = np.argsort(all_points[below] @ up)
-    return all_points[below][order], light[below][order]
+    small = [view.resized(_SAMPLES, max(1, round(_SAMPLES * view.height / view.width))) for view in views]
+    points, light = map(np.concatenate, zip(*(visible_surface(run, each, 0.9) for each in small), strict=True))
+    below = points @ up < max(float(view.position @ up) for view in views)
+    order = np.argsort(points[below] @ up)
+    return points[below][order], light[below][order]
 
 
 def _ground(at: np.ndarray, colors: np.ndarray, width: int, height: int) -> Markup:
