@@ -19,7 +19,7 @@ from ..errors import SehdrError
 if TYPE_CHECKING:
     import torch
 
-Items = str | Sequence[str | float]
+Exposures = str | Sequence[str | float]  # As written: text with commas between, or a sequence
 
 # The paper's figure writes {1/8, 1/4, dt_1, 8, 16}; as multiples of dt_1 it also serves a photo of 1/1000 s.
 PAPER_BRACKETS = ("1/8x", "1/4x", "1x", "8x", "16x")
@@ -39,7 +39,7 @@ class Exposure:
         return f"ev{round(self.ev, 1) + 0.0:+.1f}"  # Adding zero turns -0.0 into 0.0.
 
 
-def read_exposures(items: Items, base_time: float | None, field: str = "exposures") -> tuple[Exposure, ...]:
+def read_exposures(items: Exposures, base_time: float | None, field: str = "exposures") -> tuple[Exposure, ...]:
     """Parse exposures of the grammar above and sort them by time.
 
     Args:
@@ -62,12 +62,12 @@ def read_exposures(items: Items, base_time: float | None, field: str = "exposure
     return tuple(parsed)
 
 
-def exposure_times(base_time: float, items: Items = PAPER_BRACKETS) -> tuple[float, ...]:
+def exposure_times(base_time: float, items: Exposures = PAPER_BRACKETS) -> tuple[float, ...]:
     """Return the times of read_exposures(), seconds."""
     return tuple(exposure.time for exposure in read_exposures(items, base_time))
 
 
-def seconds(items: Items, field: str = "exposures") -> tuple[float, ...]:
+def seconds(items: Exposures, field: str = "exposures") -> tuple[float, ...]:
     """Return times in the order of the items; raises SehdrError for an item that is not in seconds."""
     return tuple(exposure.time for exposure in _exposures(items, None, field))
 
@@ -78,7 +78,7 @@ def is_seconds(item: str | float) -> bool:
     return not (text == "base" or text.endswith(("ev", "x")))
 
 
-def _exposures(items: Items, base_time: float | None, field: str) -> list[Exposure]:
+def _exposures(items: Exposures, base_time: float | None, field: str) -> list[Exposure]:
     """Parse each item of a list or of text separated by commas."""
     items = [item for item in items.split(",") if item.strip()] if isinstance(items, str) else items
     return [_exposure(item, base_time, field) for item in items]

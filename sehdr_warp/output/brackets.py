@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import SehdrError
 from ..files import atomic_folder, atomic_path, remove, write_json
-from ..model.exposure import Exposure, Items, read_exposures
+from ..model.exposure import Exposure, Exposures, read_exposures
 from ..own_files import is_own
 from ..scene import Camera
 from ..scene.file_names import safe_names
@@ -31,7 +31,7 @@ _SHORTEST, _LONGEST = 1e-6, 1e6  # EXIF rationals and 32-bit expTime hold these;
 
 
 def bracket_exposures(
-    base_time: float, *, evs: Items | None = None, exposures: Items | None = None
+    base_time: float, *, evs: Exposures | None = None, exposures: Exposures | None = None
 ) -> tuple[Exposure, ...]:
     """Return the exposures of a bracket, ascending.
 
@@ -75,8 +75,8 @@ def write_brackets(
     views: Mapping[str, np.ndarray] | Iterable[tuple[str, np.ndarray]],
     base_time: float,
     *,
-    evs: Items | None = None,
-    exposures: Items | None = None,
+    evs: Exposures | None = None,
+    exposures: Exposures | None = None,
     cameras: Mapping[str, Camera] | None = None,
     colorspace: str = "rec709",
     pixel: str = "half",

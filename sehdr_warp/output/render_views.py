@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import SehdrError, refuse_paths
 from ..files import atomic_folder, atomic_path
-from ..model.exposure import Items
+from ..model.exposure import Exposures
 from ..progress import track_progress
 from ..scene import Camera
 from ..scene.exposure.times import shutter
@@ -45,8 +45,8 @@ def render_views(
     cameras: str | Path = "test",
     camera: str | None = None,
     count: int = 60,
-    evs: Items | None = None,
-    exposures: Items | None = None,
+    evs: Exposures | None = None,
+    exposures: Exposures | None = None,
     multipart: bool = False,
     group_by: str = "view",
     colorspace: str = "rec709",
@@ -172,8 +172,8 @@ def check_options(
     size: str | tuple[int, int] | None,
     *,
     aovs: str | Sequence[str],
-    evs: Items | None,
-    exposures: Items | None,
+    evs: Exposures | None,
+    exposures: Exposures | None,
     pixel: str,
     multipart: bool,
     ldr_brackets: str | None,
