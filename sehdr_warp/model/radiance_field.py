@@ -1,7 +1,7 @@
 """The radiance field: Gaussians rendered as base exposure, fused HDR exposure and encoded values.
 
-Every color set that a step needs is a group of three channels of one rasterization, so that geometry is projected,
-sorted and blended once.
+Every color set that a training step needs is a group of three channels of one rasterization, so that geometry is
+projected, sorted and blended once. Confidence and shares of a picture are rasterizations of their own.
 """
 
 from collections.abc import Callable, Sequence
@@ -103,10 +103,10 @@ class RadianceField(nn.Module):
         opacity_factors: Tensor | None = None,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
     ) -> TrainRender:
-        """Render a training view, differentiably.
+        """Render what a photo shows, differentiably: for training steps, render_ldr(), and fits to pictures.
 
         Args:
-            camera: The view's camera.
+            camera: The photo's camera.
             exposure_time: Seconds; a float, or a scalar tensor on the device.
             degree: Highest SH degree, by default all.
             extra_images: Further images to render: any of "exposure" and "base".

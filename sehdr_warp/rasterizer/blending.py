@@ -53,10 +53,10 @@ def blend(
     # Detached: the autograd node owns the backward function, which must not refer to the node's own results.
     arguments = features.detach(), lists, packed, image.detach(), transmittance.detach(), alpha_threshold
     on_gpu = features.device.type == "cuda"
-    differentiate = blend_on_cuda(*arguments, deterministic) if on_gpu else blend_on_cpu(*arguments)
+    gradient_rows = blend_on_cuda(*arguments, deterministic) if on_gpu else blend_on_cpu(*arguments)
 
     def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:
-        rows = differentiate(grad_image, grad_transmittance)
+        rows = gradient_rows(grad_image, grad_transmittance)
         *others, opacity_and_padding = rows.tensor_split((channels, channels + 3, channels + 5), 1)
         return *others, opacity_and_padding.select(1, 0)
 

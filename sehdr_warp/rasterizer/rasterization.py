@@ -148,7 +148,7 @@ def rasterize(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
     )
     tensors = GaussiansAndCamera(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
-    pool = checked_pool(tensors, options)  # CUDA graphs of calls that were checked but for the background; or None
+    pool = checked_pool(tensors, options)  # Graphs of calls that were checked but for the background; None on the CPU
     if pool is None or background is not None:
         check_shapes(tensors, background)
         check_opacities(opacities)
