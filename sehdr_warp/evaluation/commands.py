@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..errors import InputError, UsageError
+from ..output.commands import changed_flags
 from ..runs.open import enclosing_run_response, load_run_scene_with_confidence, open_run
 
 if TYPE_CHECKING:
@@ -77,11 +78,12 @@ def run_evaluate(options: Evaluate) -> None:
     from .compare import eval_table
 
     if options.pictures.truth is None:
-        _refuse_unused(options.pictures, PictureOptions(), "needs --truth, the set to compare pictures with")
+        if flags := changed_flags(options.pictures):
+            raise UsageError(f"{flags[0]} needs --truth, the set to compare pictures with")
         if any(options.run.glob("*.exr")) and not (options.run / "run.json").is_file():
             raise UsageError(f"{options.run}: holds EXR pictures; add --truth, the set to compare them with")
-    else:
-        _refuse_unused(options.scene, RunOptions(), "belongs to runs; pictures with --truth do not take it")
+    elif flags := changed_flags(options.scene):
+        raise UsageError(f"{flags[0]} belongs to runs; pictures with --truth do not take it")
     result = options.result
     file = None if result.json is None or str(result.json) == "-" else result.json
     if file is not None:
@@ -99,13 +101,6 @@ def run_evaluate(options: Evaluate) -> None:
     print(eval_table(figures) if file == result.json else json.dumps(figures))
     if file is not None:
         print(file)
-
-
-def _refuse_unused(group: Any, defaults: Any, problem: str) -> None:
-    """Raise UsageError if an option of a group is set."""
-    for name, value in vars(group).items():
-        if value != getattr(defaults, name):
-            raise UsageError(f"--{name.replace('_', '-')} {problem}")
 
 
 def _evaluate_pictures(options: Evaluate, truth_path: str) -> dict[str, Any]:
