@@ -135,9 +135,6 @@ def estimate_compensation(
     times_known = scene.exposure_times_known and config.model.exposure_compensation != "always"
     views, others = scene.train_views, scene.test_views
 
-    def matcher_of(scene: Scene) -> Matcher:
-        return make_matcher(scene, response, device)
-
     def match(matcher: Matcher, count: int = POINTS) -> MatchedPoints:
         matches = matcher.match(matcher.pixels(count, np.random.default_rng(0)))
         visible = matcher.near([view.camera for view in others])[:, matches.views.cpu().numpy()]
@@ -148,12 +145,13 @@ def estimate_compensation(
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=at_matching_size(views))
-    matcher = matcher_of(small)
+    matcher = make_matcher(small, response, device)
     if times_known and not _may_drift(rough := match(matcher, ROUGH_POINTS)):
         return no_drift(matcher, rough)
     matched, guess = match(matcher), initial_gains(small.views, response)
     if not times_known and len(matched) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
-        matched = max(matched, match(matcher_of(guess.normalize_photos(small, response))), key=len)
+        alike = match(make_matcher(guess.normalize_photos(small, response), response, device))
+        matched = max(matched, alike, key=len)
     if len(matched) < MIN_POINTS:
         return no_drift(matcher, matched)
     compensation = matched.fit()
@@ -161,7 +159,8 @@ def estimate_compensation(
     if not any(components):
         return no_drift(matcher, matched, None if times_known else compensation)
     # Match again in photos that are already similar: more points are found.
-    matcher = matcher_of(compensation.parts(**components._asdict()).normalize_photos(small, response))
+    parts = compensation.parts(**components._asdict())
+    matcher = make_matcher(parts.normalize_photos(small, response), response, device)
     matched = match(matcher)
     compensation = matched.fit().parts(**components._asdict())
     return CompensationEstimate(compensation, _decision(compensation, components, matched, times_known), None)

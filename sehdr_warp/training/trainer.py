@@ -125,7 +125,7 @@ class Trainer:
 
         field.gaussians.release()  # Another trainer of this field may have reserved rows for its own optimizer.
         self.gradient_step = GradientStep(scene, config, field, self.optimizer, self.strategy, ranks, self.large_scene)
-        use_cuda_graph = config.schedule.use_cuda_graph
+        use_cuda_graph = config.schedule.use_cuda_graph  # If the device can; how photos are stored depends on it.
         self.step_runner = StepRunner(self.gradient_step, enabled=use_cuda_graph, deterministic=config.deterministic)
         self.data_manager = DataManager(views, field, config, use_cuda_graph=self.step_runner.enabled)
         self._result: StepResult | None = None  # Of the last step
