@@ -30,10 +30,7 @@ _SHARPNESS = 4  # Power of the cosine to a face's axis by which it counts: near 
 
 @torch.no_grad()
 def light_estimates(
-    views: Sequence[View],
-    response: Response | None,
-    config: LossConfig,
-    device: torch.device,
+    views: Sequence[View], response: Response | None, config: LossConfig, device: torch.device
 ) -> list[ClippedLight] | None:
     """Return what is known of each view's clipped light, on the CPU.
 

@@ -23,7 +23,7 @@ ORIENTATION_FILE = "orientation.json"
 """File in a run's folder that keeps an up direction and a scale set for it; they then need no options."""
 LIGHT_UNIT_FILE = "light_unit.json"  # File in a run's folder that keeps the unit of its light
 REMEDY = "the run is damaged: train again"
-OTHER_VERSION = "train again (train PHOTOS --out THIS_FOLDER --overwrite), or use the version that wrote it"
+_OTHER_VERSION = "train again (train PHOTOS --out THIS_FOLDER --overwrite), or use the version that wrote it"
 _SMALL, _LARGE = 16 << 20, 256 << 20
 """Largest file that is read, bytes: of one whose size does not depend on the photos, and of one with a line a photo."""
 
@@ -211,8 +211,10 @@ def read_values(path: Path, model: type[BaseModel], remedy: str = REMEDY) -> dic
             if its content is at fault.
     """
     values = read_object(path, remedy)
-    if "format" in model.model_fields:
-        _check_format(path, values)
+    if "format" in model.model_fields and (type(version := values.get("format")) is not int or version != FORMAT):
+        writer = f"sehdr-warp {values['version']:.20}" if isinstance(values.get("version"), str) else "another version"
+        problem = f"format = {version!r:.60} is of {writer}, and this one reads format {FORMAT}"
+        raise InputError(path, problem, _OTHER_VERSION)
     try:
         model.model_validate(values)
     except ValidationError as error:
@@ -245,11 +247,3 @@ def read_metrics_lines(path: Path) -> Iterator[dict[str, Any]]:
             values = json.loads(line)
             MetricsValues.model_validate(values)
             yield values
-
-
-def _check_format(path: Path, values: dict[str, Any]) -> None:
-    version = values.get("format")
-    if type(version) is not int or version != FORMAT:
-        writer = f"sehdr-warp {values['version']:.20}" if isinstance(values.get("version"), str) else "another version"
-        problem = f"format = {version!r:.60} is of {writer}, and this one reads format {FORMAT}"
-        raise InputError(path, problem, OTHER_VERSION)
