@@ -43,10 +43,6 @@ class FocalRange(NamedTuple):
         """Return the focal length of the range that is nearest to another."""
         return min(max(focal, self.least), self.most)
 
-    def samples(self, focal: float) -> int:
-        """Return how many times finer a render with a focal length in pixels must be to resolve what photos resolve."""
-        return max(1, math.ceil(self.least / focal - TOLERANCE))
-
     def variance(self, focal: float) -> float:
         """Return the variance of the photos' filter in square pixels of a render with a focal length in pixels."""
         ratio = focal / self.nearest(focal)
@@ -64,8 +60,8 @@ def samples_across_pixel(field: Any, camera: Camera) -> int:
     """
     if field.photo_focals is None or field.antialiased or not camera.is_pinhole:
         return 1
-    finest = max(1, math.isqrt(MOST_PIXELS // (camera.width * camera.height)))
-    return min(field.photo_focals.samples(camera.fx), finest)
+    resolves_photos = math.ceil(field.photo_focals.least / camera.fx - TOLERANCE)
+    return max(1, min(resolves_photos, math.isqrt(MOST_PIXELS // (camera.width * camera.height))))
 
 
 def photo_filters(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

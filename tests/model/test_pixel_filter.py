@@ -54,7 +54,8 @@ def test_photos_of_several_focal_lengths_are_rendered_as_in_training():
 def test_a_side_that_is_rounded_to_pixels_is_no_other_resolution():
     focals = FocalRange(700.0, 700.0)
     assert focals.variance(700.0 * 1.0009) == focals.variance(700.0 * 0.9991) == EPS2D
-    assert focals.samples(690.0) == 1 and focals.samples(600.0) == 2 and focals.samples(200.0) == 4
+    for focal, samples in ((690.0, 1), (600.0, 2), (200.0, 4)):
+        assert samples_across_pixel(lamps(focals), replace(PHOTO, fx=focal)) == samples
 
 
 def test_opacity_times_area_stays():
