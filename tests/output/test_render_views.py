@@ -221,6 +221,8 @@ def test_paths_need_cameras(tmp_path):
     for choice in ("test", "all", "orbit"):  # As of a file of Gaussians without a file of cameras beside it
         with pytest.raises(SehdrError, match=rf"no cameras of its own, and {choice} needs them; .*which export writes"):
             render_views(AnalyticRun([]), tmp_path / "out", cameras=choice)
+    with pytest.raises(SehdrError, match="no cameras, and so no view 'r_0'"):
+        render_views(AnalyticRun([]), tmp_path / "out", camera="r_0")
     with pytest.raises(SehdrError, match="path cannot have 0 views"):
         orbit(arc(3, 30), 0, 1)
 

@@ -37,7 +37,7 @@ def camera_named(run: "RenderableScene", name: str) -> Camera:
         raise SehdrError(f"{run.path}: has no cameras, and so no view {name!r}; {remedy}")
     if name not in cameras:
         some = first_names(list(cameras), 5)
-        hint = did_you_mean(name, cameras) or "; see scene.json of the run"
+        hint = did_you_mean(name, cameras) or "; see scene.json of the run, or the cameras beside the file"
         raise SehdrError(f"view {name!r} is not one of the scene's ({some}){hint}")
     return cameras[name]
 

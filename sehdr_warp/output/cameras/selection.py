@@ -54,7 +54,7 @@ def select_cameras(
     refuse_paths("load_run", run)
     check_cameras(cameras)
     text = str(cameras)
-    if not run.cameras and text in SPLITS + PATHS:
+    if not run.cameras and camera is None and text in SPLITS + PATHS:
         remedy = "name a file of cameras, or put one beside it, which export writes with --cameras"
         raise InputError(run.path, f"has no cameras of its own, and {text} needs them", remedy)
     if camera is not None and text in PATHS:
