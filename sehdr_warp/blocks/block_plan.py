@@ -21,8 +21,8 @@ from ..files import read_json, refuse_links, write_json
 from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_from_dict, field_and_problem, override_config
-from ..runs.open import in_world_of_run, load_scene_and_log_notes, response_for_loading
-from ..runs.scene_description import SFM_LAYOUTS
+from ..runs.open import load_scene_and_log_notes, response_for_loading
+from ..runs.scene_description import SFM_LAYOUTS, in_world_of_run
 from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationValues
 from ..scene import Camera, Scene, View
 from ..scene.exposure.compensation import ExposureCompensation

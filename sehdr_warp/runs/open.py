@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,19 +15,17 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError, SehdrError, missing
 from ..subsets import first_names
 from .device import pick_device
+from .scene_description import changed_photos, in_world_of_run, photo_signature
 from .values import SCENE_OPTIONS, LoadArguments
 
 if TYPE_CHECKING:
     from ..response import Response
-    from ..scene import Camera, Scene, View
+    from ..scene import Scene
     from .config import Config
     from .run import Run, Splats
     from .run_folder import CameraEntry
 
 log = logging.getLogger(__name__)
-
-# Cameras that differ less than this count as the same: 0.25 degrees, and parts of the cameras' radius and focal length.
-_LEAST_COSINE, _MOST_MOVED, _MOST_ZOOMED = 0.99999, 0.01, 0.005
 
 
 def open_run(path: Path, device: str | None) -> Run:
@@ -130,68 +127,11 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
 
 def _name_changed_photos(scene: Scene, run: Run, place: str) -> None:
     """Warn if photos are not those that a run was trained with, by the signatures in its scene.json."""
-    from .scene_description import changed_photos, photo_signature
-
     saved = {view["name"]: view["photo"] for view in run.folder.read_scene()["views"]}
     found = {view.name: photo_signature(view.codes, view.mask) for view in scene.views if view.name in saved}
     if changed := changed_photos(saved, found):
         text = "%s: %d of %d photos are other pictures than in the training of %s (or have other masks): %s"
         log.warning(text, place, len(changed), len(scene.views), run.path, first_names(changed))
-
-
-def in_world_of_run(
-    scene: Scene, cameras: Mapping[str, Camera], unit: float, run: Path | str, place: Path | str
-) -> Scene:
-    """Return a scene with the poses of a run's cameras, by the views' names; other views and points in the same world.
-
-    Poses that structure from motion finds anew are turned, moved and scaled as a whole.
-
-    Args:
-        scene: The scene, as it was loaded.
-        cameras: Cameras of the run, in scene coordinates.
-        unit: Length of the run's normalized coordinates, in those of the scene.
-        run: Folder of the run, to name in the error.
-        place: Folder of the photos, to name in the error.
-
-    Raises:
-        InputError: If cameras differ otherwise from those of the run.
-    """
-    import numpy as np
-
-    views = [view for view in scene.views if view.name in cameras]
-    pairs = [(view.camera, cameras[view.name]) for view in views]
-    zooms = np.array([new.fx / new.width * old.width / old.fx for new, old in pairs])
-    unlike = np.abs(zooms - 1) > _MOST_ZOOMED
-    is_same_world = all(np.array_equal(new.world_to_camera, old.world_to_camera) for new, old in pairs)
-    if is_same_world and not unlike.any():
-        return scene
-    turns = np.stack([old.world_to_camera[:3, :3].T @ new.world_to_camera[:3, :3] for new, old in pairs])
-    u, _, vt = np.linalg.svd(turns.sum(0))
-    turn = u @ vt
-    cosines = (np.einsum("nij,ij->n", turns, turn) - 1) / 2
-    found, known = np.stack([(turn @ new.position, old.position) for new, old in pairs], axis=1)
-    spread = np.linalg.norm(found - found.mean(0))
-    scale = np.linalg.norm(known - known.mean(0)) / spread if spread else 1.0
-    shift = known.mean(0) - scale * found.mean(0)
-    distances = np.linalg.norm(scale * found + shift - known, axis=1) / unit
-    unlike |= (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED)
-    if unlike.any():
-        problem = f"{unlike.sum()} of {len(views)} photos have other cameras than {run} was trained with"
-        remedy = "put photos and cameras back as they were then, or train again"
-        names = first_names([view.name for view, is_other in zip(views, unlike, strict=True) if is_other])
-        raise InputError(place, f"{problem}: {names}", remedy)
-
-    def with_pose(view: View) -> View:
-        if view.name in cameras:
-            pose = cameras[view.name].world_to_camera
-        else:
-            pose = view.camera.world_to_camera.copy()
-            pose[:3, :3] = pose[:3, :3] @ turn.T
-            pose[:3, 3] = -pose[:3, :3] @ (scale * turn @ view.camera.position + shift)
-        return replace(view, camera=replace(view.camera, world_to_camera=pose))
-
-    points = scale * scene.points @ turn.T + shift
-    return replace(scene, views=tuple(map(with_pose, scene.views)), points=points)
 
 
 def load_run_scene_with_confidence(run: Run, data: str | None) -> Scene:

@@ -1,4 +1,4 @@
-"""Description of a scene in scene.json, and whether a training is resumed with the scene that it began with.
+"""Description of a scene in scene.json, and whether a run is used with the scene that its training began with.
 
 Photos are described by signatures: the mean of the codes in a grid of GRID x GRID cells, of 8 bits each. It survives
 another decoder, whose codes may differ by one, and changes with a photo that was edited, exchanged or developed anew.
@@ -7,18 +7,23 @@ That of a masked photo has a second part, of the mask.
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ..scene import Scene, View
+from ..errors import InputError
+from ..scene import Camera, Scene, View
 from ..scene.photo_names import photo_labels
+from ..subsets import first_names
 from .values import FORMAT
 
 GRID = 8
 _MOST_ROWS = 32  # Rows that are read of each row of cells; more would take longer for large photos and find little more
 SFM_LAYOUTS = "photos", "video"  # Layouts of sets whose cameras structure from motion finds
+# Cameras that differ less than this count as the same: 0.25 degrees, and parts of the cameras' radius and focal length.
+_LEAST_COSINE, _MOST_MOVED, _MOST_ZOOMED = 0.99999, 0.01, 0.005
 _TOLERANCE = 2  # Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded
 
 
@@ -131,3 +136,56 @@ def _differ(first: str, second: str) -> bool:
     if [cells.shape for cells in one] != [cells.shape for cells in other]:
         return True
     return any((np.abs(a.astype(int) - b) > _TOLERANCE).any() for a, b in zip(one, other, strict=True))
+
+
+def in_world_of_run(
+    scene: Scene, cameras: Mapping[str, Camera], unit: float, run: Path | str, place: Path | str
+) -> Scene:
+    """Return a scene with the poses of a run's cameras, by the views' names; other views and points in the same world.
+
+    Poses that structure from motion finds anew are turned, moved and scaled as a whole.
+
+    Args:
+        scene: The scene, as it was loaded.
+        cameras: Cameras of the run, in scene coordinates.
+        unit: Length of the run's normalized coordinates, in those of the scene.
+        run: Folder of the run, to name in the error.
+        place: Folder of the photos, to name in the error.
+
+    Raises:
+        InputError: If cameras differ otherwise from those of the run.
+    """
+    views = [view for view in scene.views if view.name in cameras]
+    pairs = [(view.camera, cameras[view.name]) for view in views]
+    zooms = np.array([new.fx / new.width * old.width / old.fx for new, old in pairs])
+    unlike = np.abs(zooms - 1) > _MOST_ZOOMED
+    is_same_world = all(np.array_equal(new.world_to_camera, old.world_to_camera) for new, old in pairs)
+    if is_same_world and not unlike.any():
+        return scene
+    turns = np.stack([old.world_to_camera[:3, :3].T @ new.world_to_camera[:3, :3] for new, old in pairs])
+    u, _, vt = np.linalg.svd(turns.sum(0))
+    turn = u @ vt
+    cosines = (np.einsum("nij,ij->n", turns, turn) - 1) / 2
+    found, known = np.stack([(turn @ new.position, old.position) for new, old in pairs], axis=1)
+    spread = np.linalg.norm(found - found.mean(0))
+    scale = np.linalg.norm(known - known.mean(0)) / spread if spread else 1.0
+    shift = known.mean(0) - scale * found.mean(0)
+    distances = np.linalg.norm(scale * found + shift - known, axis=1) / unit
+    unlike |= (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED)
+    if unlike.any():
+        problem = f"{unlike.sum()} of {len(views)} photos have other cameras than {run} was trained with"
+        remedy = "put photos and cameras back as they were then, or train again"
+        names = first_names([view.name for view, is_other in zip(views, unlike, strict=True) if is_other])
+        raise InputError(place, f"{problem}: {names}", remedy)
+
+    def with_pose(view: View) -> View:
+        if view.name in cameras:
+            pose = cameras[view.name].world_to_camera
+        else:
+            pose = view.camera.world_to_camera.copy()
+            pose[:3, :3] = pose[:3, :3] @ turn.T
+            pose[:3, 3] = -pose[:3, :3] @ (scale * turn @ view.camera.position + shift)
+        return replace(view, camera=replace(view.camera, world_to_camera=pose))
+
+    points = scale * scene.points @ turn.T + shift
+    return replace(scene, views=tuple(map(with_pose, scene.views)), points=points)

@@ -17,10 +17,9 @@ from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config, require_same_config, with_iterations_of
 from ..runs.device import pick_device
 from ..runs.field import field_from_checkpoint
-from ..runs.open import in_world_of_run
 from ..runs.run import Run, exposure_compensation
 from ..runs.run_writer import RunWriter
-from ..runs.scene_description import SFM_LAYOUTS
+from ..runs.scene_description import SFM_LAYOUTS, in_world_of_run
 from ..runs.values import LoadArguments
 from ..scene import Scene
 from ..scene.normalization import Normalization, normalization_of

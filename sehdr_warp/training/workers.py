@@ -10,9 +10,9 @@ from ..errors import InputError
 from ..runs.checkpoint import Checkpoint
 from ..runs.config import Config
 from ..runs.field import field_from_checkpoint
-from ..runs.open import PhotoRequest, in_world_of_run
+from ..runs.open import PhotoRequest
 from ..runs.run import exposure_compensation
-from ..runs.scene_description import SFM_LAYOUTS, describe_scene, scene_difference
+from ..runs.scene_description import SFM_LAYOUTS, describe_scene, in_world_of_run, scene_difference
 from ..scene import Camera, Scene
 from ..scene.normalization import Normalization
 from .cost import gain_of_ranks

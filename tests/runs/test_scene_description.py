@@ -3,9 +3,14 @@
 from dataclasses import replace
 from pathlib import Path
 
-from sehdr_warp.runs.scene_description import describe_scene
+import numpy as np
+import pytest
+
+from sehdr_warp.errors import InputError
+from sehdr_warp.runs.scene_description import describe_scene, in_world_of_run
 from sehdr_warp.scene.lens import Lens
 
+from ..found_cameras import TURN, in_other_world
 from ..training.toy import toy_scene
 
 
@@ -17,3 +22,34 @@ def test_photos_of_one_name_in_several_folders_are_told_apart():
     views = [replace(v, source=Path("DCIM", f), lens=lens) for v, f in zip(scene.views, files, strict=True)]
     described = describe_scene(replace(scene, views=tuple(views), format="photos"))
     assert [view["lens"]["file"] for view in described["views"]] == [*files]
+
+
+def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_the_run():
+    """Structure from motion turns the world by chance; one camera that moved, turned or zoomed is named."""
+    scene = toy_scene(6, 8)
+    cameras = {view.name: view.camera for view in scene.views}
+    views = [replace(view, camera=in_other_world(view.camera)) for view in scene.views]
+    points = 3 * scene.points @ TURN.T + [1, 2, 3]
+    found = replace(scene, views=tuple(views), points=points)
+    aligned = in_world_of_run(found, cameras, 4.0, "run", "photos")
+    for view in aligned.views:
+        np.testing.assert_array_equal(view.camera.world_to_camera, cameras[view.name].world_to_camera)
+    np.testing.assert_allclose(aligned.points, scene.points, atol=1e-12)
+    assert in_world_of_run(scene, cameras, 4.0, "run", "photos") is scene
+    del cameras[scene.views[-1].name]  # A photo that was added since is placed in the world of the run.
+    added = in_world_of_run(found, cameras, 4.0, "run", "photos").views[-1].camera
+    np.testing.assert_allclose(added.world_to_camera, scene.views[-1].camera.world_to_camera, atol=1e-12)
+    first = views[0].camera
+    moved, turned = first.world_to_camera.copy(), first.world_to_camera.copy()
+    moved[:3, 3] += 0.5
+    turned[:3, :3] = turned[:3, :3] @ TURN
+    turned[:3, 3] = -turned[:3, :3] @ first.position
+    zoom = {"fx": 1.01 * first.fx, "fy": 1.01 * first.fy}
+    zoomed = replace(scene.views[0], camera=replace(scene.views[0].camera, **zoom))  # In the world of the run
+    with pytest.raises(InputError, match="1 of 5 photos have other cameras than run was trained with: v_0"):
+        in_world_of_run(replace(scene, views=(zoomed, *scene.views[1:])), cameras, 4.0, "run", "photos")
+    changes = [{"world_to_camera": moved}, {"world_to_camera": turned}, zoom]
+    for change in changes:
+        changed = replace(views[0], camera=replace(first, **change))
+        with pytest.raises(InputError, match="of 5 photos have other cameras than run was trained with: v_0"):
+            in_world_of_run(replace(scene, views=(changed, *views[1:])), cameras, 4.0, "run", "photos")
