@@ -223,7 +223,7 @@ class BracketWriter:
             label = f"b{index:0{digits}d}_{exposure.label}"
             facts = {"view": name, "ev": repr(exposure.ev), **reason}
             title = label if self.multipart else ""
-            parts.append(self.header.part(radiance, exposure.time, camera, name=title, **facts))
+            parts.append(self.header.part(radiance, exposure.time, camera, {}, title, **facts))
             place = f"{name}/{name}_{label}" if self.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if self.multipart else f"{place}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}

@@ -44,7 +44,7 @@ class PictureHeader:
         radiance: np.ndarray,
         exposure: float,
         camera: Camera | None,
-        others: Mapping[str, np.ndarray] | None = None,
+        others: Mapping[str, np.ndarray],
         name: str = "",
         **provenance: str,
     ) -> Part:
@@ -62,7 +62,7 @@ class PictureHeader:
         white = None if self.luminance_of_one is None else self.luminance_of_one / exposure
         attributes = exr_header(self.colorspace, exposure, camera, self.captured, values, white)
         colors = rgb_channels(from_rec709(radiance, self.colorspace) * exposure)
-        return Part(colors | dict(others or {}), attributes, name)
+        return Part({**colors, **others}, attributes, name)
 
 
 def provenance(run: "RenderableScene") -> dict[str, str]:
