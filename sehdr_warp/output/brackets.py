@@ -223,14 +223,15 @@ class BracketWriter:
             label = f"b{index:0{digits}d}_{exposure.label}"
             facts = {"view": name, "ev": repr(exposure.ev), **reason}
             title = label if self.multipart else ""
-            parts.append(self.header.part(radiance, exposure.time, camera, {}, title, **facts))
+            part = self.header.part(radiance, exposure.time, camera, {}, title, **facts)
             place = f"{name}/{name}_{label}" if self.group_by == "view" else f"{label}/{name}"
             file = f"{name}.exr" if self.multipart else f"{place}.exr"
             entry = {"index": index, "exposure_time": exposure.time, "ev": exposure.ev, "file": f"brackets/{file}"}
             if self.multipart:
                 entry["part"] = index
+                parts.append(part)
             else:
-                write_multipart_exr(self._folder / file, parts[-1:], pixel=pixel)
+                write_multipart_exr(self._folder / file, [part], pixel=pixel)
             if self.ldr:
                 photo = f"{place}.{'jpg' if self.ldr == 'jpeg' else 'png'}"
                 exif = exposure_exif(exposure.time, bias=exposure.ev, captured=self.header.captured)

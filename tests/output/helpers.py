@@ -54,7 +54,6 @@ class AnalyticRun:
     base_time, color_matrix, exposure_compensation = 0.5, None, None
     scene_name = "sky"
     iterations = 7
-    path = "runs/sky"
     gaussian_count, train_seconds, path = 1234, 65.0, "runs/sky"
 
     def __init__(self, names=(("r_0", "train"), ("r_1", "train"), ("r_2", "train"), ("t_0", "test"), ("t_1", "test"))):
