@@ -55,30 +55,52 @@ def unused_bits_note(largest: int, *, linear: bool) -> list[str]:
     return [f"{note}, what clips there counts as measured; multiply their codes by {2 ** (16 - bits)}"]
 
 
-def circle_note(photos: Sequence[Path]) -> tuple[str, ...]:
-    """Return a note if bare photos are circles in black frames, whose lens structure from motion does not know."""
+def frame_notes(photos: Sequence[Path]) -> tuple[str, ...]:
+    """Return notes if bare photos are circles in black frames, or have black bars at their edges.
+
+    Structure from motion does not know the lens of the one, and the other would become part of the scene.
+    """
     if any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
         return ()
     try:
-        outside, inside = np.median([_around_circle(photo) for photo in every_nth(photos, _JUDGED)], axis=0)
+        pictures = [_thumbnail(photo) for photo in every_nth(photos, _JUDGED)]
     except (InputError, *PILLOW_ERRORS):
         return ()  # The readers of these photos report what is wrong with them.
-    if outside >= _BLACK or inside < _SHOWN:
-        return ()
-    note = "photos are circles in black frames, as of a fisheye lens, but their cameras are found as of a usual lens"
-    return (f"{note}: bring cameras of COLMAP's OPENCV_FISHEYE, or convert the photos to usual ones",)
+    outside, inside = np.median([_around_circle(codes) for codes in pictures], axis=0)
+    if outside < _BLACK and inside >= _SHOWN:
+        note = "photos are circles in black frames, as of a fisheye lens, but their cameras are found as of a usual"
+        return (f"{note} lens: bring cameras of COLMAP's OPENCV_FISHEYE, or convert the photos to usual ones",)
+    sides = {"top": 0, "right": 1, "bottom": 2, "left": 3}  # Quarter turns that bring a side to the top
+    bars = [side for side, turns in sides.items() if _have_bars([np.rot90(codes, turns) for codes in pictures])]
+    note = f"photos have black bars ({', '.join(bars)}), which become part of the scene"
+    return (f"{note}: crop them off, or leave them out by a mask.png that is black there",) * bool(bars)
 
 
-def _around_circle(photo: Path) -> tuple[float, float]:
-    """Return nearly the brightest code outside the largest circle in a photo, and nearly the darkest just inside."""
+def _thumbnail(photo: Path) -> np.ndarray:
     with open_image(photo) as image:
         image.draft("L", (2 * _SIDE, 2 * _SIDE))
         small = image.convert("L")
         small.thumbnail((_SIDE, _SIDE), Image.Resampling.BOX)
-        codes = np.asarray(small)
+        return np.asarray(small)
+
+
+def _around_circle(codes: np.ndarray) -> tuple[float, float]:
+    """Return nearly the brightest code outside the largest circle in a photo, and nearly the darkest just inside."""
     if min(codes.shape) < _SIDE / 8:
         return 255.0, 0.0
     rows, columns = (np.arange(side) - (side - 1) / 2 for side in codes.shape)
     radius = np.hypot(rows[:, None], columns) / (min(codes.shape) / 2)
     ring = (radius > 0.8) & (radius < 0.92)
     return float(np.percentile(codes[radius > 1.08], 95)), float(np.percentile(codes[ring], 20))
+
+
+def _have_bars(pictures: Sequence[np.ndarray]) -> bool:
+    """Return whether the first rows of all pictures are black, equally many, and the next row of most is not.
+
+    The ground around an object ends elsewhere in each picture, and nowhere along a whole row.
+    """
+    edges = [int(np.argmax(np.percentile(codes, 98, axis=1) >= _BLACK)) for codes in pictures]
+    if min(edges) < _SIDE / 32 or max(edges) > min(edges) + 1:
+        return False
+    beyond = [np.percentile(codes[edge:][:2][-1], 20) for codes, edge in zip(pictures, edges, strict=True)]
+    return float(np.median(beyond)) >= _SHOWN

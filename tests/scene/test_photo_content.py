@@ -6,7 +6,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.photo_content import circle_note
+from sehdr_warp.scene.photo_content import frame_notes
 from tests.make_scenes import load, pattern, write_colmap
 
 
@@ -42,7 +42,22 @@ def test_circles_in_black_frames_are_told_of(tmp_path, inner, told):
     for i, photo in enumerate(photos):
         codes = np.maximum(pattern(320, 240, i), 60) * (radius < inner)[..., None]
         Image.fromarray(codes.astype(np.uint8)).save(photo)
-    assert any("circles in black frames" in note for note in circle_note(photos)) == told
+    assert [note[:32] for note in frame_notes(photos)] == ["photos are circles in black fram"] * told
+
+
+@pytest.mark.parametrize(("top", "left", "bars"), [(30, 0, "top, bottom"), (0, 40, "right, left"), (2, 2, "")])
+def test_black_bars_are_told_of(tmp_path, top, left, bars):
+    """Frames of wide films have them; a backdrop around an object ends elsewhere in each photo."""
+    photos = [tmp_path / f"{i}.jpg" for i in range(3)]
+    for i, photo in enumerate(photos):
+        codes = np.zeros((240, 320, 3), np.uint8)
+        codes[top : 240 - top, left : 320 - left] = np.maximum(pattern(320 - 2 * left, 240 - 2 * top, i), 60)
+        Image.fromarray(codes).save(photo)
+    notes = frame_notes(photos)
+    assert [note.split(")")[0] for note in notes] == [f"photos have black bars ({bars}"] * bool(bars)
+    codes[: top + 20] = codes[220 - top :] = codes[:, : left + 20] = codes[:, 300 - left :] = 0
+    Image.fromarray(codes).save(photo)
+    assert not frame_notes(photos)
 
 
 def test_photos_that_are_nearly_opaque_everywhere_show_something(tmp_path):

@@ -28,7 +28,7 @@ from ..file_names import (
 )
 from ..images.heif import HEIF_SUFFIXES, register_heif
 from ..images.ldr_files import PHOTO_SUFFIXES
-from ..photo_content import circle_note
+from ..photo_content import frame_notes
 from ..photo_names import fold_name, photo_labels
 from ..photos import FEWEST_PHOTOS
 from ..raw.decode import color_matrix
@@ -183,7 +183,7 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
         else:
             uncertain = i in reconstruction.weak
             placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera, uncertain=uncertain))
-    notes = dataset.notes + circle_note(photos) + reconstruction.notes(photos)
+    notes = dataset.notes + frame_notes(photos) + reconstruction.notes(photos)
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
 
 
