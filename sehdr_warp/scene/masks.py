@@ -14,12 +14,13 @@ from ..files import resolve_inside
 from ..subsets import counted, first_names
 from .dataparser import UNPLACED, ImageRecord
 from .file_names import INVERTED_MASK, MASK_FOLDERS, folders_named, lies_at, natural_key, without_mask_mark
-from .images.ldr_files import JPEG_SUFFIXES, LDR_SUFFIXES, open_image, read_ldr
+from .images.ldr_files import JPEG_SUFFIXES, LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
 from .lens import Lens
 from .photo_names import PhotoNames, fold_name
 
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
 _COMMON = ("mask", "camera_mask")  # Stems of a mask of all photos
+_BLACK_AND_WHITE = 0.9  # Part of such a mask that has these values
 _MOST_LABELS = 31  # Larger values are weights relative to white
 _MATERIAL = 0.5  # Range of alpha that is a mask beside color that varies, too
 _REMEDY = "name each like its photo, such as masks/IMG_1.png or masks/IMG_1.jpg.png"
@@ -143,15 +144,25 @@ def mask_note(shares: Sequence[float | None], labeled: int = 0) -> list[str]:
 
 
 def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> tuple[Path, tuple[int, int]] | None:
-    """Return the mask of all photos and its (width, height); None without one, or if the data folder holds photos."""
-    if not folder.is_dir() or any(record.image.parent == folder for record in records):
-        return None
+    """Return the mask of all photos and its (width, height); None without one, or if it is one of the photos."""
     names = (f"{stem}{suffix}" for stem in _COMMON for suffix in LDR_SUFFIXES)
     file = next((folder / name for name in names if (folder / name).is_file()), None)
-    if file is None:
+    if file is None or any(record.image == file for record in records):
         return None
     with open_image(resolve_inside(folder, file.name, folder), mask=True) as image:
         return file, image.size
+
+
+def is_common_mask(file: Path) -> bool:
+    """Return whether a file among photos is the mask of all: it has that name, and is black and white."""
+    if file.stem not in _COMMON or file.suffix.lower() not in LDR_SUFFIXES:
+        return False
+    try:
+        with open_image(file, mask=True) as image:
+            codes = np.asarray(image.convert("L"))
+            return bool(((codes < 8) | (codes > 247)).mean() > _BLACK_AND_WHITE)
+    except (InputError, *PILLOW_ERRORS):
+        return False
 
 
 def _has_shape(size: tuple[int, int], lens: Lens) -> bool:

@@ -55,8 +55,8 @@ def unused_bits_note(largest: int, *, linear: bool) -> list[str]:
     return [f"{note}, what clips there counts as measured; multiply their codes by {2 ** (16 - bits)}"]
 
 
-def frame_notes(photos: Sequence[Path]) -> tuple[str, ...]:
-    """Return notes if bare photos are circles in black frames, or have black bars at their edges.
+def frame_notes(photos: Sequence[Path], *, masked: bool = False) -> tuple[str, ...]:
+    """Return notes if bare photos are circles in black frames, or have black bars at their edges and are not `masked`.
 
     Structure from motion does not know the lens of the one, and the other would become part of the scene.
     """
@@ -73,7 +73,9 @@ def frame_notes(photos: Sequence[Path]) -> tuple[str, ...]:
     sides = {"top": 0, "right": 1, "bottom": 2, "left": 3}  # Quarter turns that bring a side to the top
     bars = [side for side, turns in sides.items() if _have_bars([np.rot90(codes, turns) for codes in pictures])]
     note = f"photos have black bars ({', '.join(bars)}), which become part of the scene"
-    return (f"{note}: crop them off, or leave them out by a mask.png that is black there",) * bool(bars)
+    return (f"{note}: crop them off, or leave them out by a mask.png that is black there",) * (
+        bool(bars) and not masked
+    )
 
 
 def _thumbnail(photo: Path) -> np.ndarray:

@@ -7,7 +7,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.file_names import list_images
-from sehdr_warp.scene.masks import read_mask
+from sehdr_warp.scene.masks import assign_masks, read_mask
 from sehdr_warp.scene.readers.bare_photos import find_photos
 from tests.make_scenes import (
     RadianceView,
@@ -279,3 +279,14 @@ def test_masks_in_a_folder_of_each_camera(tmp_path):
     scene = load(tmp_path, holdout=0)
     assert shares(scene) == [1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
     assert not any("in no view" in note for note in scene.notes)
+
+
+def test_a_mask_of_all_photos_lies_among_bare_photos(tmp_path):
+    """A photo may have its name."""
+    for i in range(4):
+        Image.fromarray(pattern(64, 48, i)).save(tmp_path / f"{i}.jpg")
+    Image.fromarray(pattern(64, 48, 5)).save(tmp_path / "mask.png")
+    assert [record.view for record in find_photos(tmp_path).records] == ["0", "1", "2", "3", "mask"]
+    write_mask(tmp_path / "mask.png", HALF)
+    records, _ = assign_masks(find_photos(tmp_path).records, tmp_path)
+    assert [(record.view, record.mask) for record in records] == [(str(i), tmp_path / "mask.png") for i in range(4)]

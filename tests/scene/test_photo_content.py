@@ -55,6 +55,7 @@ def test_black_bars_are_told_of(tmp_path, top, left, bars):
         Image.fromarray(codes).save(photo)
     notes = frame_notes(photos)
     assert [note.split(")")[0] for note in notes] == [f"photos have black bars ({bars}"] * bool(bars)
+    assert not frame_notes(photos, masked=True)
     codes[: top + 20] = codes[220 - top :] = codes[:, : left + 20] = codes[:, 300 - left :] = 0
     Image.fromarray(codes).save(photo)
     assert not frame_notes(photos)

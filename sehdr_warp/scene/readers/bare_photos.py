@@ -28,6 +28,7 @@ from ..file_names import (
 )
 from ..images.heif import HEIF_SUFFIXES, register_heif
 from ..images.ldr_files import PHOTO_SUFFIXES
+from ..masks import is_common_mask
 from ..photo_content import frame_notes
 from ..photo_names import fold_name, photo_labels
 from ..photos import FEWEST_PHOTOS
@@ -82,6 +83,7 @@ def find_photos(folder: Path) -> DataparserOutputs:
     places = (place for place in (folder, folder / "images", folder / INPUT) if place.is_dir())
     listed = [list_images(place, PHOTO_SUFFIXES) for place in places]
     maps = set(itertools.chain(*map(find_maps, listed)))
+    listed = [[picture for picture in pictures if not is_common_mask(picture)] for pictures in listed]
     # Pictures without others beside them are grey photos with such a word in their names.
     candidates = [[picture for picture in pictures if picture not in maps] or pictures for pictures in listed]
     photos = max(candidates, key=len)  # Fewer pictures beside `images/` are a cover, or pictures of results.
@@ -183,7 +185,7 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
         else:
             uncertain = i in reconstruction.weak
             placed.append(replace(record, lens=image.lens, world_to_camera=image.world_to_camera, uncertain=uncertain))
-    notes = dataset.notes + frame_notes(photos) + reconstruction.notes(photos)
+    notes = dataset.notes + frame_notes(photos, masked=any(masks)) + reconstruction.notes(photos)
     return replace(dataset, records=tuple(placed), cloud=model.cloud, notes=notes), unplaced
 
 
