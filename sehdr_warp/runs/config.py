@@ -176,6 +176,10 @@ class McmcConfig(_Table):
     prune_near_angle: Weight = 0.0
     """relocate Gaussians whose standard deviation exceeds this multiple of the distance to the nearest training camera
     (floaters in front of cameras); 0 disables"""
+    prune_near_points: Fraction = 0.5
+    """relocate Gaussians that a training photo shows nearer than this share of the distance of its nearest points in
+    the set, of which 2 % do not count (floaters in front of cameras); not where a photo shows less than a tenth of the
+    scene; 0 disables"""
 
 
 class AdcConfig(_Table):

@@ -113,6 +113,7 @@ class CheckpointValues(Values):
     sha256: str
     run: Annotated[dict[str, str], Field(default_factory=dict)]
     large_scene: bool | None = None
+    nearest_points: list[float] | None = None
 
 
 class RegionValues(Values):

@@ -192,10 +192,10 @@ def _resumed_trainer(
     field = field_from_checkpoint(checkpoint, config, info).to(device)
     compensation = exposure_compensation(info)
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
-    large_scene = checkpoint.values.get("large_scene")
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
     longer = config.continued_after(finished_at)
-    trainer = Trainer(scene, longer, field, ranks=ranks, large_scene=large_scene)
+    facts = {name: checkpoint.values.get(name) for name in ("large_scene", "nearest_points")}
+    trainer = Trainer(scene, longer, field, ranks=ranks, **facts)
     try:
         load_state(trainer, checkpoint)
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:

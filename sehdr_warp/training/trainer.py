@@ -42,7 +42,7 @@ from .run_output import RunOutput
 from .scene_facts import is_large
 from .seeding import make_seeds
 from .step_runner import StepRunner
-from .strategies import SEED_STRIDE, Seeds, make_strategy
+from .strategies import SEED_STRIDE, Seeds, TrainingCameras, distances_of_points, make_strategy
 from .training_progress import TrainingProgress
 
 log = logging.getLogger(__name__)
@@ -77,6 +77,7 @@ class Trainer:
         first_iteration: Iterations done before this process.
         total: Iterations in all.
         large_scene: Whether photos show little of the scene, see scene_facts.is_large().
+        nearest_points: Distances of the nearest points from the cameras, see strategies.floaters; 0 in a large scene.
         batch: Photos of a step, one for each rank; each counts as an iteration.
         step_batch: Photos of the last step: `batch`, or fewer if fewer iterations were left.
         seconds: Duration so far, without evaluation, renders for figures that are shown, and checkpoints.
@@ -91,12 +92,13 @@ class Trainer:
         get_matcher: Callable[[], Matcher] | None = None,
         ranks: Ranks | None = None,
         large_scene: bool | None = None,
+        nearest_points: list[float] | None = None,
     ):
         """Prepare a training on the device of the field; create_trainer() does this for a scene and a run folder.
 
         `config` is that after the plan. get_matcher() returns the matcher of the training photos that seeding uses,
-        by default a new one. `ranks` train together. `large_scene` is that of a training that goes on, whose scene may
-        lack points; by default scene_facts.is_large() of the scene.
+        by default a new one. `ranks` train together. large_scene and nearest_points are those of a training that goes
+        on, whose scene may lack points; by default those of the scene.
         """
         self.scene, self.config, self.field, self.ranks = scene, config, field, ranks
         self.output: RunOutput | None = None
@@ -108,9 +110,11 @@ class Trainer:
         views = normalized.train_views
         self.optimizer = make_optimizer(field, config, self.batch)
         pixels = sum(view.camera.width * view.camera.height for view in views)
-        positions = torch.tensor([view.camera.position.tolist() for view in views], device=self.device)
         self.large_scene = is_large(scene) if large_scene is None else large_scene
-        self.strategy = make_strategy(config, pixels, positions, large_scene=self.large_scene)
+        points = normalized.points[:0] if self.large_scene else normalized.points
+        self.nearest_points = distances_of_points(views, points) if nearest_points is None else nearest_points
+        cameras = TrainingCameras.of_views(views, self.nearest_points, self.device)
+        self.strategy = make_strategy(config, pixels, cameras, large_scene=self.large_scene)
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.sampler = PhotoSampler(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)

@@ -30,7 +30,7 @@ def state_of(trainer: Trainer) -> Checkpoint:
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
     values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining}
     values |= {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
-    values |= {"large_scene": trainer.large_scene}
+    values |= {"large_scene": trainer.large_scene, "nearest_points": trainer.nearest_points}
     return Checkpoint(tensors, values)
 
 

@@ -78,7 +78,8 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
         ranks.share_photos(scene, _bytes_of(scene))
     else:
         scene = ranks.receive_photos()
-    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks, large_scene=message.values["large_scene"])
+    facts = {name: message.values[name] for name in ("large_scene", "nearest_points")}
+    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks, **facts)
     load_state(trainer, checkpoint)
     del message, checkpoint, tensors
     for _ in trainer:

@@ -31,6 +31,7 @@ FIELDS = [
     ("mcmc", "densification.prune_opacity", 0.3),
     ("mcmc", "loss.size_weight", 1.0),
     ("mcmc", "mcmc.prune_near_angle", 0.02),
+    ("mcmc", "mcmc.prune_near_points", 1.0),
     ("adc", "densification.prune_opacity", 0.3),
     ("adc", "adc.grow_grad2d", 5e-3),
     ("adc", "adc.grow_scale3d", 1.0),

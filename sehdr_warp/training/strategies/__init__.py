@@ -6,23 +6,32 @@ density control of 3D Gaussian Splatting (Kerbl et al. 2023, section 5.2, with t
 
 import math
 
-from torch import Tensor
-
 from ...runs.config import Config
 from .adc import AdcStrategy
 from .base import SEED_STRIDE, MakeSeeds, Schedule, Seeds, Strategy
+from .floaters import TrainingCameras, distances_of_points
 from .mcmc import DENSE, McmcStrategy, mcmc_cap
 
-__all__ = ["SEED_STRIDE", "AdcStrategy", "MakeSeeds", "McmcStrategy", "Seeds", "Strategy", "make_strategy", "mcmc_cap"]
+__all__ = [
+    "SEED_STRIDE",
+    "AdcStrategy",
+    "MakeSeeds",
+    "McmcStrategy",
+    "Seeds",
+    "Strategy",
+    "TrainingCameras",
+    "distances_of_points",
+    "make_strategy",
+    "mcmc_cap",
+]
 
 
 def make_strategy(
-    config: Config, pixels: int, camera_positions: Tensor | None = None, *, large_scene: bool = False
+    config: Config, pixels: int, cameras: TrainingCameras | None = None, *, large_scene: bool = False
 ) -> AdcStrategy | McmcStrategy:
     """Create the strategy that config.densification.strategy names.
 
-    The training photos have `pixels` in all and camera_positions [V, 3], in the Gaussians' coordinates. large_scene: as
-    of scene_facts.is_large().
+    The training photos have `pixels` in all. large_scene: as of scene_facts.is_large().
     """
     schedule, prune_opacity = Schedule.from_config(config), config.densification.prune_opacity
     if config.densification.strategy == "adc":
@@ -35,6 +44,6 @@ def make_strategy(
         prune_opacity,
         options=config.mcmc,
         random_seed=config.seed,
-        camera_positions=camera_positions,
+        cameras=cameras,
         dense=large_scene and cap > DENSE * math.sqrt(pixels),
     )

@@ -11,9 +11,9 @@ from ...rasterizer.ops.relocation import SampledRows, copy_rows, count_copies, n
 from ...rasterizer.ops.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
 from .base import SEED_STRIDE, MakeSeeds, Strategy
+from .floaters import TrainingCameras, floater_mask
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
-DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
 LEAST_MEAN_OPACITY = 0.03
 """New Gaussians are added only while the mean opacity stays above this. Copies share the opacity of their source. Where
 photos contradict each other, growth would make all Gaussians fainter until they are dead and the scene is lost."""
@@ -51,7 +51,7 @@ class McmcStrategy(Strategy):
 
     options: McmcConfig = field(default_factory=McmcConfig)  # Options of the strategy
     random_seed: int = 0  # Seed of the training
-    camera_positions: Tensor | None = None  # [V, 3] positions of the training cameras, for prune_near_angle
+    cameras: TrainingCameras | None = None  # Before which floaters are relocated; None leaves them
     dense: bool = False  # Whether copies take over the second moments of their source, see reset_moments()
 
     @torch.no_grad()
@@ -67,7 +67,9 @@ class McmcStrategy(Strategy):
         added = self.next_count(iteration, count) - count
         if added > 0:  # The only value that the host waits for
             added = min(added, max(0, int(opacities.sum() / LEAST_MEAN_OPACITY) - count))
-        dead = (opacities <= self.prune_opacity) | self._near_cameras(gaussians)
+        dead = opacities <= self.prune_opacity
+        if self.cameras is not None:
+            dead |= floater_mask(gaussians, self.cameras, self.options)
         slot_of_row, dead_count = number_slots(dead, added)
         gaussians.resize(count + added, optimizer)
         changed = torch.zeros_like(slot_of_row, dtype=torch.bool)
@@ -145,16 +147,6 @@ class McmcStrategy(Strategy):
                 most_distance=MAX_DISTANCE,
                 seed=(self.random_seed * SEED_STRIDE + iteration) % 2**31,
             )
-
-    def _near_cameras(self, gaussians: Gaussians) -> Tensor:
-        """Return a mask [N] of floaters: Gaussians wider than prune_near_angle times their distance to a camera."""
-        means, cameras = gaussians.means, self.camera_positions
-        if cameras is None or not self.options.prune_near_angle:
-            return torch.zeros(len(means), dtype=torch.bool, device=means.device)
-        exact = "donot_use_mm_for_euclid_dist"
-        parts = means.split(max(1, DISTANCES_AT_ONCE // len(cameras)))
-        nearest = torch.cat([torch.cdist(part, cameras, compute_mode=exact).amin(1) for part in parts])
-        return gaussians.log_scales.amax(1) > torch.log(self.options.prune_near_angle * nearest)
 
 
 def reset_moments(gaussians: Gaussians, optimizer: Optimizer | None, which: Tensor, left: float) -> None:

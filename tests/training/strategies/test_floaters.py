@@ -1,0 +1,64 @@
+"""Floaters: which Gaussians before the training cameras are relocated, and which stay."""
+
+import numpy as np
+import pytest
+import torch
+
+from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.runs.config import McmcConfig
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.scene import Camera, View, look_at
+from sehdr_warp.training.strategies import TrainingCameras, distances_of_points, floaters, make_strategy
+
+
+def view_from(position, target):
+    """A photo of 40 by 40 pixels and 90 degrees."""
+    camera = Camera(40, 40, 20.0, 20.0, 20.0, 20.0, look_at(position, target, (0, 1, 0)))
+    return View("photo", np.zeros((40, 40, 3), np.uint8), camera, 1.0, "train")
+
+
+def gaussians_at(means, widths, device):
+    gaussians = Gaussians.from_points(torch.tensor(means), torch.ones(len(means), 3), 0).to(device)
+    sizes = torch.tensor([[width, 0.01, 0.01] for width in widths], device=device)
+    gaussians.overwrite({"log_scales": sizes.log(), "opacity_logits": torch.zeros(len(means), device=device)})
+    return gaussians
+
+
+def test_the_nearest_points_of_a_photo_are_those_in_its_view_without_mismatches():
+    views = [view_from((0, 0, 0), (0, 0, 1)), view_from((0, 0, 0), (0, 0, -1))]
+    behind = np.column_stack([np.zeros((20, 2)), np.full(20, -2.0)])
+    before = np.column_stack([np.zeros((100, 2)), np.linspace(1, 10.9, 100)])
+    distances = distances_of_points(views, np.concatenate([behind, [[0, 0, 0.01]], before]))
+    assert distances == [pytest.approx(1.1), 0], "of 101 points the nearest two do not count; 20 points are too few"
+    assert distances_of_points(views, np.zeros((0, 3))) == [0, 0]
+
+
+@pytest.mark.parametrize("share,expected", [(0.0, []), (0.5, [0, 4]), (1.0, [0, 3, 4])])
+@pytest.mark.parametrize("at_once", [3, 1 << 24])
+def test_what_is_nearer_to_a_photo_than_its_points_and_in_its_view_is_a_floater(
+    device, share, expected, at_once, monkeypatch
+):
+    monkeypatch.setattr(floaters, "DISTANCES_AT_ONCE", at_once)
+    views = [view_from((0, 0, 0), (0, 0, 1)), view_from((0, 0, 10), (0, 0, 20)), view_from((50, 0, 0), (51, 0, 0))]
+    cameras = TrainingCameras.of_views(views, [4.0, 4.0, 0.0], device)
+    # In view and near; as near, but beside the view and behind the camera; farther; near to the other two photos.
+    means = [(0.5, 0.5, 1.8), (2.0, 0.0, 0.5), (0.0, 0.0, -0.5), (0.5, 0.5, 2.1), (0.0, 0.0, 11.0), (50.1, 0.0, 0.0)]
+    gaussians = gaussians_at(means, [0.01] * 6, device)
+    mask = floaters.floater_mask(gaussians, cameras, McmcConfig(prune_near_points=share))
+    assert mask.nonzero()[:, 0].tolist() == expected
+
+
+def test_relocation_moves_what_veils_a_camera(device):
+    views = [view_from((0, 0, 0), (0, 0, 1)), view_from((0, 0, 100), (0, 0, 200))]
+    means = [(0.0, 0.0, z) for z in (0.9, 1.1, 2.0, 10.0, 50.0, 91.0, 97.1, 99.1)]
+    gaussians = gaussians_at(means, [0.25, 0.25, 0.4, 2.4, 12.0, 2.2, 0.75, 0.2], device)
+    before = gaussians.means.detach().clone()
+    options = {"mcmc.prune_near_angle": 0.25, "mcmc.growth_rate": 0.0, "mcmc.seed_fraction": 0.0}
+    cameras = TrainingCameras.of_views(views, [0.0, 0.0], device)
+    strategy = make_strategy(load_config("default", options), 10**6, cameras)
+    optimizer = torch.optim.Adam(gaussians.parameters())
+    assert not strategy.refine(600, gaussians, optimizer, torch.Generator(device))
+    # More than a quarter of 0.9 from the first camera, and of 2.9 from the second; not of the others.
+    moved = (gaussians.means.detach() != before).any(1)
+    assert moved.tolist() == [True, False, False, False, False, False, True, False]
+    assert set(map(tuple, gaussians.means[moved].tolist())) <= set(map(tuple, before[~moved].tolist()))
