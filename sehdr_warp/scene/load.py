@@ -193,7 +193,8 @@ def parse_dataset(
         unused = [*unused_notes(folder, all_records, [*unplaced, *dataset.mentioned]), *unread_geometry(root)]
     if training < 2:
         counts = f"{len(records)} view{'s' * (len(records) != 1)}, {training} for training"
-        raise InputError(folder, f"has {counts}; one view does not show depth", "add views from other places")
+        remedy = "hold out fewer (--holdout 8, or 0 for none)" if len(records) > 1 else "add views from other places"
+        raise InputError(folder, f"has {counts}; one view does not show depth", remedy)
     notes = dataset.notes, mask_notes, truth_notes, exposure_notes, photo_notes, time_notes
     notes = tuple(chain(*notes, pose_notes, camera_notes, split_notes, unused))
     return replace(dataset, records=tuple(records), notes=notes, name=name, unplaced=len(unplaced))
