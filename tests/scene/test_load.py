@@ -165,7 +165,7 @@ def test_splits(tmp_path):
     assert [view.name for view in load(tmp_path).test_views] == ["000", "008"]
     assert [view.name for view in load(tmp_path, holdout=4).test_views] == ["000", "004", "008"]
     assert not load(tmp_path, holdout=0).test_views
-    with pytest.raises(InputError, match=r"9 views, 1 for training.*--holdout 8, or 0 for none"):
+    with pytest.raises(InputError, match=r"9 views, 0 for training.*holdout 8, or 0 for none"):
         load(tmp_path, holdout=1)
     write_colmap(tmp_path / "few", 4)
     few = load(tmp_path / "few")
