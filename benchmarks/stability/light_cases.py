@@ -9,7 +9,7 @@ import torch
 from sehdr_warp.check.case import ROUNDINGS, UNIT, Case, Reading, compare, count, not_finite
 from sehdr_warp.model.color_models import EXPOSURE_FLOOR
 from sehdr_warp.model.fusion import NeuralExposureFusion
-from sehdr_warp.model.renders import TrainRender
+from sehdr_warp.model.renders import PhotoRender
 from sehdr_warp.rasterizer import ssim
 from sehdr_warp.rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy
 from sehdr_warp.rasterizer.ops.exposure_fusion import fusion_weights
@@ -148,7 +148,7 @@ def _loss(prediction, photo):
     """Return the training's loss between encoded values of a simulated and a black and white photo, [H, W, 3]."""
     codes = (255 * photo).to(prediction.device, torch.uint8)
     target = Target(codes, code_scale(255, None, prediction.device, dtype=prediction.dtype))
-    render = TrainRender(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
+    render = PhotoRender(prediction, None, None, None)  # pyright: ignore[reportArgumentType]
     return ldr_loss(render, target, LossConfig())
 
 

@@ -74,7 +74,7 @@ def _gradient_norms(device):
     norms, broken = {}, 0
     for name, ssim, opacity in (("L1", 0.0, 0.0), ("L1 and SSIM", 0.2, 0.0), ("opacity", 0.0, 0.01)):
         config = load_config("default", {"loss.ssim_weight": ssim, "loss.opacity_weight": opacity}).loss
-        photo = field.render_train_view(view.camera, view.exposure_time)
+        photo = field.render_photo(view.camera, view.exposure_time)
         field.zero_grad(set_to_none=True)
         (data_loss(field, photo, view.target, config) + opacity_loss(field, photo, config.opacity_weight)).backward()
         gradients = [p.grad for p in field.gaussians.parameters() if p.grad is not None]

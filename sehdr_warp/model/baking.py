@@ -238,7 +238,7 @@ def fit_to_pictures(
         decay = 0.5 * (1 + math.cos(math.pi * step / len(order)))
         for group, rate in zip(optimizer.param_groups, RATES.values(), strict=True):
             group["lr"] = rate * decay
-        rendered = field.render_train_view(field.camera_tensors(cameras[index]), field.base_time).encoded
+        rendered = field.render_photo(field.camera_tensors(cameras[index]), field.base_time).encoded
         assert rendered is not None
         optimizer.zero_grad()
         (rendered.clamp(0, 1) - targets[index]).square().mean().backward()

@@ -19,7 +19,7 @@ from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
 from .pixel_filter import EPS2D, FocalRange, keep_light
-from .renders import CameraTensors, DirectionalRender, RenderedView, TrainRender
+from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView
 
 _DECODED_AT_ONCE = 1 << 19  # Pixels
 
@@ -91,7 +91,7 @@ class RadianceField(nn.Module):
         require_camera(camera)
         return CameraTensors.of(self.normalization.camera(camera), self.gaussians.means.device)
 
-    def render_train_view(
+    def render_photo(
         self,
         camera: CameraTensors,
         exposure_time: float | Tensor,
@@ -102,7 +102,7 @@ class RadianceField(nn.Module):
         encode: bool = True,
         opacity_factors: Tensor | None = None,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
-    ) -> TrainRender:
+    ) -> PhotoRender:
         """Render what a photo shows, differentiably: for training steps, render_ldr(), and fits to pictures.
 
         Args:
@@ -127,7 +127,7 @@ class RadianceField(nn.Module):
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
-            return TrainRender(image, None, None, rendering, opacities=opacities)
+            return PhotoRender(image, None, None, rendering, opacities=opacities)
         color_sets = self._color_sets(values, ratio, extra_images)
         first, *others = color_sets.values()
         features = torch.cat([first, *others], dim=1) if others else first
@@ -141,7 +141,7 @@ class RadianceField(nn.Module):
             if not (isinstance(ratio, float) and ratio == 1):
                 photo_exposure = photo_exposure * ratio
             encoded = self.response.encode_extended(photo_exposure) if encode else None
-        return TrainRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure, opacities)
+        return PhotoRender(encoded, exposure, images.get("base", exposure), rendering, photo_exposure, opacities)
 
     def _color_sets(self, values: Tensor, ratio: float | Tensor, extra_images: frozenset[str]) -> dict[str, Tensor]:
         """Return the colors [N, 3] that a training view needs, by name: any of encoded, exposure and base."""
@@ -246,7 +246,7 @@ class RadianceField(nn.Module):
         """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base time."""
         tensors = self.camera_tensors(camera)
         time = self.base_time if exposure_time is None else exposure_time
-        photo = self.render_train_view(tensors, time, degree=degree).encoded
+        photo = self.render_photo(tensors, time, degree=degree).encoded
         assert photo is not None
         return photo.clamp(0, 1)
 

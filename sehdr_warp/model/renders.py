@@ -13,7 +13,7 @@ from ..scene.wide_camera import pixel_directions
 
 
 @dataclass(frozen=True)
-class TrainRender:
+class PhotoRender:
     """A differentiable render of a training view; images [H, W, 3], None if they were not requested.
 
     Attributes:

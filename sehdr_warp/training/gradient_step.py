@@ -190,7 +190,7 @@ class GradientStep:
         """
         target, camera, field = view.target, view.camera, self.field
         sh_gradients: list[Tensor] = []
-        render = field.render_train_view(
+        render = field.render_photo(
             camera,
             view.exposure_time,
             degree=options.degree,

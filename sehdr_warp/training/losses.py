@@ -5,7 +5,7 @@ from torch import Tensor
 
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
-from ..model.renders import TrainRender
+from ..model.renders import PhotoRender
 from ..rasterizer.losses.code_residual import code_residual
 from ..rasterizer.losses.opacity_penalty import opacity_penalty
 from ..rasterizer.losses.photo_loss import ClippedWeights, clipped_light_energy, photo_loss
@@ -43,7 +43,7 @@ def _distance_weight(form: str, weight: float) -> float:
     return 1.0 if form == "sum" else 1 - weight
 
 
-def ldr_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor:
+def ldr_loss(render: PhotoRender, target: Target, config: LossConfig) -> Tensor:
     """Return L_LDR on the target's scale.
 
     If exposures are compared, the light of clipped pixels, which the photo does not determine, is smoothed and held at
@@ -73,7 +73,7 @@ def ldr_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor:
     return loss
 
 
-def compared_image(render: TrainRender, target: Target) -> Tensor:
+def compared_image(render: PhotoRender, target: Target) -> Tensor:
     """Return the image that is compared with the photo: exposures if the target has them, else encoded values."""
     image = render.photo_exposure if target.scale.compares_exposures else render.encoded
     assert image is not None
@@ -95,7 +95,7 @@ def anchor_loss(mapper: ToneMapper) -> Tensor:
     return (mapper.encode_log(mapper.weights[0].new_zeros(1, 3)) - ANCHOR).square().mean()
 
 
-def linear_loss(render: TrainRender, target: Target, config: LossConfig) -> Tensor | None:
+def linear_loss(render: PhotoRender, target: Target, config: LossConfig) -> Tensor | None:
     """Return L_linear (SeHDR, equation 19): base exposure against HDR truth or the fused exposure; None without one."""
     truth = target.exposure_truth if config.hdr_truth else None
     if truth is None and render.base is render.exposure:
@@ -108,7 +108,7 @@ def linear_loss(render: TrainRender, target: Target, config: LossConfig) -> Tens
     return image_loss(render.base, truth, target.mask, config.form, config.ssim_weight)
 
 
-def hdr_loss(render: TrainRender, target: Target, config: LossConfig, largest: float) -> Tensor:
+def hdr_loss(render: PhotoRender, target: Target, config: LossConfig, largest: float) -> Tensor:
     """Return the loss of the HDR color's exposure against HDR truth in the mu-law.
 
     Both are divided by the largest truth of all views. HDR-GS divides each image by its own maximum, which leaves the
@@ -120,7 +120,7 @@ def hdr_loss(render: TrainRender, target: Target, config: LossConfig, largest: f
 
 
 def extra_images(config: LossConfig, has_truth: bool) -> frozenset[str]:
-    """Return the extra images that render_train_view() must render for data_loss."""
+    """Return the extra images that render_photo() must render for data_loss."""
     images = {"exposure"} if config.hdr_weight > 0 and has_truth else set()
     if config.linear_weight > 0:
         images |= {"base"} if config.hdr_truth and has_truth else {"base", "exposure"}
@@ -128,7 +128,7 @@ def extra_images(config: LossConfig, has_truth: bool) -> frozenset[str]:
 
 
 def data_loss(
-    field: RadianceField, render: TrainRender, target: Target, config: LossConfig, largest_truth: float = 1.0
+    field: RadianceField, render: PhotoRender, target: Target, config: LossConfig, largest_truth: float = 1.0
 ) -> Tensor:
     """Return L_LDR + beta L_linear (SeHDR, equation 20) + HDR loss + anchor, each if it has a weight."""
     loss = ldr_loss(render, target, config) if config.ldr_weight > 0 else 0.0
@@ -145,7 +145,7 @@ def data_loss(
     return loss
 
 
-def opacity_loss(field: RadianceField, render: TrainRender, weight: float, moments: Tensor | None = None) -> Tensor:
+def opacity_loss(field: RadianceField, render: PhotoRender, weight: float, moments: Tensor | None = None) -> Tensor:
     """Return `weight` times the mean opacity of the Gaussians.
 
     With Adam's second moments [N] of the opacities, those that no photo has shown yet do not count.

@@ -5,7 +5,7 @@ gradient step (forward, loss, backward, optimizer) is in gradient_step.py; run_o
 training_state.py lists what a checkpoint holds. On several ranks, each runs this loop; only rank 0 has an output.
 
 Trainer.step() -> StepRunner.run() -> GradientStep.run(). Its compute_gradients() calls
-RadianceField.render_train_view() -> spherical_harmonics() (kernels harmonics) and rasterize() (kernels project, tiles,
+RadianceField.render_photo() -> spherical_harmonics() (kernels harmonics) and rasterize() (kernels project, tiles,
 blend_cuda or blend_cpu), then data_loss() and differentiate(); its apply_gradients() calls decide_step() -> Adam.step()
 (on a GPU, kernels step_updates). On a GPU, StepRunner.run() captures it as a CUDA graph; a replay repeats its kernels.
 Before the first step, create_trainer() matches points between photos (kernels plane_sweep), makes the Gaussians, and
@@ -339,7 +339,7 @@ class Trainer:
         self.synchronize()
         view = self.data_manager.views[self._view_index]
         with self.step_runner.on_capture_stream():
-            photo = self.field.render_train_view(view.camera, view.exposure_time, degree=self.degree).encoded
+            photo = self.field.render_photo(view.camera, view.exposure_time, degree=self.degree).encoded
         assert photo is not None
         return view.target.psnr(photo)
 

@@ -31,7 +31,7 @@ def wall(exposure, radiance="log", depth=3.0, **options):
 
 
 def photograph(field, time=TIME, **options):
-    return field.render_train_view(CameraTensors.of(CAMERA, "cpu"), time, **options)
+    return field.render_photo(CameraTensors.of(CAMERA, "cpu"), time, **options)
 
 
 @pytest.mark.parametrize("radiance", ["log", "linear"])

@@ -103,7 +103,7 @@ def test_a_field_photographs_through_it_and_teaches_it(tone_map, device):
     gaussians = Gaussians.from_points(torch.tensor([[0.0, 0.0, 3.0]]), torch.full((1, 3), -1.0), 0, opacity=0.99)
     gaussians.overwrite({"log_scales": torch.full((1, 3), 4.0), "opacity_logits": torch.full((1,), 12.0)})
     field = RadianceField(gaussians, ToneMapper(8), base_time=0.5, tone_map=tone_map).to(device)
-    photo = field.render_train_view(CameraTensors.of(CAMERA, device), 2.0, extra_images=frozenset({"exposure"}))
+    photo = field.render_photo(CameraTensors.of(CAMERA, device), 2.0, extra_images=frozenset({"exposure"}))
     covered = float(photo.rendering.alpha.detach()[6, 8])
     expected = field.response.encode(torch.full((3,), float(np.exp(-1.0)) * 4.0, device=device)) * covered
     torch.testing.assert_close(photo.encoded[6, 8], expected, rtol=0.02, atol=0)

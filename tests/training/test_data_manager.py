@@ -110,7 +110,7 @@ def test_gradients_of_a_panorama_reach_all_parameters():
     field = make_field(scene, config, response_by_name("srgb"), "cpu")
     camera = field.camera_tensors(scene.train_views[0].camera)
     assert isinstance(camera, CameraTensors) and camera.directions.shape == (HEIGHT, WIDTH, 3)
-    photo = field.render_train_view(camera, 1.0)
+    photo = field.render_photo(camera, 1.0)
     photo.photo_exposure.square().mean().backward()
     for name in ("means", "log_scales", "opacity_logits", "harmonics_dc"):
         assert getattr(field.gaussians, name).grad.abs().sum() > 0, name

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sehdr_warp.model.gaussians import Gaussians
-from sehdr_warp.model.renders import TrainRender
+from sehdr_warp.model.renders import PhotoRender
 from sehdr_warp.rasterizer.losses.code_residual import code_tensor
 from sehdr_warp.rasterizer.losses.ssim import ssim
 from sehdr_warp.response import response_by_name
@@ -78,7 +78,7 @@ def test_clipped_pixels_push_up_and_black_ones_down_alone(name, bits):
     encoded.requires_grad_()
     target = target_of(photo, response, bits=bits)
     config = LossConfig(ssim_weight=0.0, clipped_smoothness=0.0)
-    ldr_loss(TrainRender(encoded, None, None, None, encoded), target, config).backward()
+    ldr_loss(PhotoRender(encoded, None, None, None, encoded), target, config).backward()
     assert encoded.grad[0, :, 0].sign().tolist() == [0, 0, -1, 1, 0, 0, 1]
 
 
@@ -88,7 +88,7 @@ def test_clipped_light_evens_out_where_exposures_are_compared(clipping):
     light = (response.white * torch.tensor([[1.5, 6.0, 1.5, 1.5]])[..., None].expand(1, 4, 3)).double().requires_grad_()
     config = LossConfig(clipping=clipping, ssim_weight=0.0, clipped_smoothness=1.0)
     target = target_of(torch.ones(1, 4, 3).double(), response, clipping=clipping)
-    ldr_loss(TrainRender(light, light, light, None, light), target, config).backward()
+    ldr_loss(PhotoRender(light, light, light, None, light), target, config).backward()
     # Without clipping each is too bright for a photo that shows white.
     assert light.grad[0, :, 0].sign().tolist() == ([-1, 1, -1, -1] if clipping else [1, 1, 1, 1])
 
@@ -102,12 +102,12 @@ def test_clipped_light_is_held_at_its_estimate_as_firmly_as_that_is_sure():
     estimates[..., 3:] = torch.tensor([1.0, 1.0, 0.1, 0.1, 1.0])[None, :, None]
     config = LossConfig(ssim_weight=0.0, clipped_smoothness=0.0, clipped_estimate=1.0)
     light.requires_grad_()
-    ldr_loss(TrainRender(light, light, light, None, light), replace(target, estimates=estimates), config).backward()
+    ldr_loss(PhotoRender(light, light, light, None, light), replace(target, estimates=estimates), config).backward()
     slopes = (light.grad * light.detach())[0, :, 0]
     assert slopes[0] < 0 < slopes[1]  # A photo's clipped pixels alone: the last is brighter than its photo shows.
     assert (slopes[2:4] / slopes[:2]).tolist() == pytest.approx([0.01, 0.01], rel=1e-2)
     plain = light.detach().requires_grad_()
-    ldr_loss(TrainRender(plain, plain, plain, None, plain), target, config).backward()
+    ldr_loss(PhotoRender(plain, plain, plain, None, plain), target, config).backward()
     assert plain.grad[0, :4].abs().max() == 0 and plain.grad[0, 4, 0] == light.grad[0, 4, 0]
 
 
@@ -128,7 +128,7 @@ def test_light_anywhere_within_what_a_code_stands_for_is_as_good_once_it_is_an_i
     light = response.decode(places / 255).requires_grad_()
     target = target_of(torch.full((1, 8, 3), 254 / 255).double(), response, clipping=clipping)
     for wide in (False, clipping):
-        loss = ldr_loss(TrainRender(light, light, light, None, light), target, LossConfig(clipped_smoothness=0.0))
+        loss = ldr_loss(PhotoRender(light, light, light, None, light), target, LossConfig(clipped_smoothness=0.0))
         (slopes,) = torch.autograd.grad(loss, light)
         assert (loss.item() < 1e-12) == wide and bool((slopes == 0).all()) == wide
         target.scale.use_intervals()
@@ -136,14 +136,14 @@ def test_light_anywhere_within_what_a_code_stands_for_is_as_good_once_it_is_an_i
 
 def test_without_clipping_an_overshoot_costs():
     predicted, target = torch.full((2, 2, 3), 1.3), target_of(torch.ones(2, 2, 3), clipping=False)
-    loss = ldr_loss(TrainRender(predicted, None, None, None), target, LossConfig(ssim_weight=0.0))
+    loss = ldr_loss(PhotoRender(predicted, None, None, None), target, LossConfig(ssim_weight=0.0))
     assert loss.item() == pytest.approx(0.3, rel=1e-5)
 
 
 def test_exposures_are_compared_where_the_scale_says_so():
     response = response_by_name("srgb")
     light = images(3)[0].double() * 0.8 + 0.05
-    photo = TrainRender(response.encode_extended(light), light, light, None, light)
+    photo = PhotoRender(response.encode_extended(light), light, light, None, light)
     encoded = target_of(images(4)[0].double(), clipping=False)
     plain = image_loss(photo.encoded, encoded.encoded.double(), None, "sum", 0.2).item()
     assert ldr_loss(photo, encoded, LossConfig()).item() == pytest.approx(plain, rel=1e-6)
@@ -160,7 +160,7 @@ def test_gradients_of_the_photo_loss(wide):
     light = (torch.rand(4, 5, 3, generator=generator, dtype=torch.float64) + 0.1).requires_grad_()
 
     def loss(x):
-        return ldr_loss(TrainRender(x, x, x, None, x), target, LossConfig())
+        return ldr_loss(PhotoRender(x, x, x, None, x), target, LossConfig())
 
     assert torch.autograd.gradcheck(loss, light, eps=1e-7, atol=1e-6)
 
@@ -171,7 +171,7 @@ def test_the_mu_law_weighs_shadows_as_the_metric_does(bits):
     codes = row(0.1, 0.6).double()
     target = target_of(codes, response, bits=bits)
     light = response.decode(target.encoded.double())
-    loss = ldr_loss(TrainRender(light, light, light, None, 2 * light), target, LossConfig(ssim_weight=0.0))
+    loss = ldr_loss(PhotoRender(light, light, light, None, 2 * light), target, LossConfig(ssim_weight=0.0))
     mu = mu_of_knee(response)
     expected = (mu_law(2 * light, response.white, mu) - mu_law(light, response.white, mu)).mean()
     assert loss.item() == pytest.approx(expected.item(), rel=1e-3)
@@ -189,11 +189,11 @@ def test_the_knee_is_at_its_code_above_black(name, code):
 
 def test_truth_supervises_the_base_and_without_it_there_may_be_nothing_to_compare():
     base, truth = images(2)
-    photo = TrainRender(base, torch.zeros_like(base), base, None)
+    photo = PhotoRender(base, torch.zeros_like(base), base, None)
     config = LossConfig(linear_weight=0.5, hdr_truth=True)
     assert linear_loss(photo, target_of(truth, truth=base), config).item() == pytest.approx(0, abs=1e-6)
     assert linear_loss(photo, target_of(truth, truth=truth), config) > 0.1
-    assert linear_loss(TrainRender(base, base, base, None), target_of(base), LossConfig()) is None
+    assert linear_loss(PhotoRender(base, base, base, None), target_of(base), LossConfig()) is None
 
 
 @pytest.mark.parametrize("reserved", [0, 5])

@@ -120,7 +120,7 @@ def test_gaussians_are_born_where_the_photos_are_not_explained(device):
     with torch.no_grad():
         # Opaque, so that the wall is explained from the start.
         field.gaussians.opacity_logits.fill_(4.0)
-        photo = field.render_train_view(views[0].camera, views[0].exposure_time, degree=0).encoded
+        photo = field.render_photo(views[0].camera, views[0].exposure_time, degree=0).encoded
     budget = torch.tensor(200, device=device)
     inputs = field, matcher, photo, views[0], 0
     (rows, born), (again, roomy) = (make_seeds(*inputs, budget, room, random_seed=3) for room in (200, 300))

@@ -9,7 +9,7 @@ import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.color_models import make_color_model
-from sehdr_warp.model.renders import TrainRender
+from sehdr_warp.model.renders import PhotoRender
 from sehdr_warp.rasterizer.losses.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import Config, LossConfig, ResponseConfig
@@ -51,13 +51,13 @@ def test_the_hdr_loss_compares_in_the_mu_law():
     exposure, truth = images(0), images(1)
     config = LossConfig(form="blend", hdr_weight=1.0)
     target = target_of(truth / 4, truth)
-    loss = hdr_loss(TrainRender(exposure, exposure, exposure, None), target, config, 4.0)
+    loss = hdr_loss(PhotoRender(exposure, exposure, exposure, None), target, config, 4.0)
     a, b = ((1 + 5000 * x / 4).log() / math.log1p(5000) for x in (exposure, truth))
     assert float(loss) == pytest.approx(float(0.8 * (a - b).abs().mean() + 0.2 * (1 - ssim(a, b))), rel=1e-4)
 
 
 def test_weights_mix_photos_and_truth(scene):
-    photo = TrainRender(images(0) / 4, images(1), images(1), None)
+    photo = PhotoRender(images(0) / 4, images(1), images(1), None)
     target = target_of(images(2) / 4, images(3))
     field = make_trainer(scene, quick()).field
 

@@ -77,7 +77,7 @@ def check_harmonics(degree: int, coefficients: Any, means: Any, camera_position:
 class HarmonicsGradients:
     """Gradients of harmonics' coefficients as their factors: 3 numbers for a Gaussian and view in place of 48.
 
-    The gradients are sums over the views. In a training on a GPU, RadianceField.render_train_view() hooks grad_colors,
+    The gradients are sums over the views. In a training on a GPU, RadianceField.render_photo() hooks grad_colors,
     FlatGradients joins the ranks' views, and Adam.step() multiplies the factors out in its kernel
     (harmonics_adam_step), so that the gradients of the coefficients are never stored.
     """

@@ -176,7 +176,7 @@ def test_renders_of_a_field_hold_no_graphs():
         field.weighted_sums(field.camera_tensors(camera), torch.ones(24, 32, 2, device=DEVICE))
     assert not cache._pools
     for _ in range(CALLS):
-        field.render_train_view(field.camera_tensors(camera), 1.0)
+        field.render_photo(field.camera_tensors(camera), 1.0)
     assert recordings()
 
 
