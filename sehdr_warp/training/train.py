@@ -195,6 +195,9 @@ def _resumed_trainer(
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
     longer = config.continued_after(finished_at)
     facts = {name: checkpoint.values.get(name) for name in ("large_scene", "nearest_points")}
+    if (distances := facts["nearest_points"]) is not None and len(distances) != len(scene.train_views):
+        problem = f"nearest_points has {len(distances)} values, and {len(scene.train_views)} photos are trained on"
+        raise InputError(checkpoint.path, problem, "remove it, or train again")
     trainer = Trainer(scene, longer, field, ranks=ranks, **facts)
     try:
         load_state(trainer, checkpoint)

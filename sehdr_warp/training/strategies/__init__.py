@@ -44,6 +44,6 @@ def make_strategy(
         prune_opacity,
         options=config.mcmc,
         random_seed=config.seed,
-        cameras=cameras,
+        cameras=None if cameras is None else cameras.used_by(config.mcmc),
         dense=large_scene and cap > DENSE * math.sqrt(pixels),
     )

@@ -12,7 +12,7 @@ from ...runs.config import McmcConfig
 from ...scene import View
 from ...subsets import every_nth
 
-DISTANCES_AT_ONCE = 1 << 24  # Gaussian-camera distances in memory at once
+DISTANCES_AT_ONCE = 1 << 22  # Gaussian-camera distances in memory at once
 MISMATCHES = 2.0  # Percent of the points of a photo, the nearest ones, that do not count: some are mismatches
 FEWEST_POINTS = 20  # A photo that shows fewer points says nothing about what is near
 MOST_POINTS = 20_000  # That are looked at
@@ -40,6 +40,13 @@ class TrainingCameras(NamedTuple):
         )
         return TrainingCameras(*(torch.tensor(np.array(each), dtype=torch.float32, device=device) for each in values))
 
+    def used_by(self, options: McmcConfig) -> "TrainingCameras | None":
+        """Return the cameras by which floater_mask() finds floaters, None if there are none."""
+        if options.prune_near_angle:
+            return self
+        used = options.prune_near_points * self.nearest_points > 0
+        return TrainingCameras(*(each[used] for each in self)) if used.any() else None
+
 
 def distances_of_points(views: Sequence[View], points: np.ndarray) -> list[float]:
     """Return the distances [V] of the points [P, 3] that are nearest to the camera of a photo and in its view.
@@ -63,11 +70,14 @@ def floater_mask(gaussians: Gaussians, cameras: TrainingCameras, options: McmcCo
     FreeNeRF (CVPR 2023), which takes density next to the cameras away.
     """
     nearest, near = [], []
-    least, exact = options.prune_near_points * cameras.nearest_points, "donot_use_mm_for_euclid_dist"
+    least = options.prune_near_points * cameras.nearest_points
     for means in gaussians.means.detach().split(max(1, DISTANCES_AT_ONCE // len(cameras.positions))):
-        distances = torch.cdist(means, cameras.positions, compute_mode=exact)
-        nearest.append(distances.amin(1))
-        rows, views = (distances < least).nonzero(as_tuple=True)
+        # Not torch.cdist(), which on a GPU takes 256 threads for each distance.
+        squares = sum((means[:, axis, None] - cameras.positions[:, axis]).square_() for axis in range(3))
+        assert isinstance(squares, Tensor)
+        if options.prune_near_angle:
+            nearest.append(squares.amin(1).sqrt())
+        rows, views = (squares < least.square()).nonzero(as_tuple=True)
         in_view = _in_view(means[rows], views, cameras)
         near.append(torch.zeros(len(means), dtype=torch.bool, device=means.device).index_fill_(0, rows[in_view], True))
     mask = torch.cat(near)

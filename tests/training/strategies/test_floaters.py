@@ -48,6 +48,19 @@ def test_what_is_nearer_to_a_photo_than_its_points_and_in_its_view_is_a_floater(
     assert mask.nonzero()[:, 0].tolist() == expected
 
 
+def test_cameras_that_find_no_floaters_take_no_time(device):
+    views = [view_from((0, 0, 0), (0, 0, 1)), view_from((0, 0, 0), (0, 0, -1))]
+
+    def cameras_of(distances, **options):
+        values = {f"mcmc.{name}": value for name, value in options.items()}
+        cameras = TrainingCameras.of_views(views, distances, device)
+        return make_strategy(load_config("default", values), 10**6, cameras).cameras
+
+    assert cameras_of([0.0, 0.0]) is None and cameras_of([1.0, 2.0], prune_near_points=0.0) is None
+    assert cameras_of([0.0, 2.0]).nearest_points.tolist() == [2]
+    assert cameras_of([0.0, 2.0], prune_near_angle=0.1).nearest_points.tolist() == [0, 2]
+
+
 def test_relocation_moves_what_veils_a_camera(device):
     views = [view_from((0, 0, 0), (0, 0, 1)), view_from((0, 0, 100), (0, 0, 200))]
     means = [(0.0, 0.0, z) for z in (0.9, 1.1, 2.0, 10.0, 50.0, 91.0, 97.1, 99.1)]
