@@ -15,8 +15,8 @@ from ..subsets import counted, first_names
 from .dataparser import UNPLACED, ImageRecord
 from .file_names import INVERTED_MASK, MASK_FOLDERS, folders_named, lies_at, natural_key, without_mask_mark
 from .images.ldr_files import JPEG_SUFFIXES, LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
-from .lens import Lens
 from .photo_names import PhotoNames, fold_name
+from .photos import photo_sizes
 
 _OTHER_MASKS = (".gif", ".npy", ".npz", ".exr", ".json", ".svg")
 _COMMON = ("mask", "camera_mask")  # Stems of a mask of all photos
@@ -33,8 +33,8 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     its view (PhotoNames), such as `masks/cam0/1.jpg.png` or `masks/cam0/1.png`. without_mask_mark() says which marks
     of the stem are ignored. Files with such a mark beside the photos are masks as well, and so are those of a folder of
     MASK_FOLDERS there.
-    `mask.png` or `camera_mask.png` of the data folder is the mask of all photos of its shape that have none of their
-    own, as of a tripod or a car's bonnet.
+    `mask.png` or `camera_mask.png` of the data folder, or of the only folder of photos, is the mask of all photos of
+    its shape that have none of their own, as of a tripod or a car's bonnet.
 
     Args:
         records: the photos; a mask that the set states itself stays.
@@ -57,7 +57,7 @@ def assign_masks(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     for record in records:
         near = beside[record.image.parent]
         mask = record.mask or photo_names.file_of(record, tables, near, by_view=True)
-        if mask is None and common is not None and _has_shape(common[1], record.lens):
+        if mask is None and common is not None and _has_shape(common[1], record):
             mask = common[0]
         mask_files.add(mask)
         masked.append(replace(record, mask=mask))
@@ -145,11 +145,13 @@ def mask_note(shares: Sequence[float | None], labeled: int = 0) -> list[str]:
 
 def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> tuple[Path, tuple[int, int]] | None:
     """Return the mask of all photos and its (width, height); None without one, or if it is one of the photos."""
-    names = (f"{stem}{suffix}" for stem in _COMMON for suffix in LDR_SUFFIXES)
-    file = next((folder / name for name in names if (folder / name).is_file()), None)
-    if file is None or any(record.image == file for record in records):
+    parents = {record.image.parent for record in records}
+    places = [folder, *(place for place in parents if len(parents) == 1 and place.is_relative_to(folder))]
+    files = (place / f"{stem}{suffix}" for place in places for stem in _COMMON for suffix in LDR_SUFFIXES)
+    found = (file for file in files if file.is_file() and (file.parent == folder or is_common_mask(file)))
+    if (file := next(found, None)) is None or any(record.image == file for record in records):
         return None
-    with open_image(resolve_inside(folder, file.name, folder), mask=True) as image:
+    with open_image(resolve_inside(folder, file.relative_to(folder).as_posix(), folder), mask=True) as image:
         return file, image.size
 
 
@@ -165,9 +167,15 @@ def is_common_mask(file: Path) -> bool:
         return False
 
 
-def _has_shape(size: tuple[int, int], lens: Lens) -> bool:
-    """Return whether a size has the shape of a lens's photos, as far as that is known."""
-    return lens is UNPLACED or abs(size[0] * lens.height - size[1] * lens.width) <= max(size)
+def _has_shape(size: tuple[int, int], record: ImageRecord) -> bool:
+    """Return whether a size has the shape of a photo."""
+    width, height = record.lens.width, record.lens.height
+    if record.lens is UNPLACED:
+        try:
+            width, height = photo_sizes(record.image)[record.oriented]
+        except InputError:
+            return False  # The readers of this photo report what is wrong with it.
+    return abs(size[0] * height - size[1] * width) <= max(size)
 
 
 def _key(mask: Path, place: Path) -> str:

@@ -281,12 +281,18 @@ def test_masks_in_a_folder_of_each_camera(tmp_path):
     assert not any("in no view" in note for note in scene.notes)
 
 
-def test_a_mask_of_all_photos_lies_among_bare_photos(tmp_path):
+@pytest.mark.parametrize("place", ["", "images"])
+def test_a_mask_of_all_photos_lies_among_bare_photos(tmp_path, place):
     """A photo may have its name."""
+    folder = tmp_path / place
+    folder.mkdir(exist_ok=True)
     for i in range(4):
-        Image.fromarray(pattern(64, 48, i)).save(tmp_path / f"{i}.jpg")
-    Image.fromarray(pattern(64, 48, 5)).save(tmp_path / "mask.png")
+        Image.fromarray(pattern(64, 48, i)).save(folder / f"{i}.jpg")
+    Image.fromarray(pattern(64, 48, 5)).save(folder / "mask.png")
     assert [record.view for record in find_photos(tmp_path).records] == ["0", "1", "2", "3", "mask"]
-    write_mask(tmp_path / "mask.png", HALF)
+    write_mask(folder / "mask.png", HALF)
     records, _ = assign_masks(find_photos(tmp_path).records, tmp_path)
-    assert [(record.view, record.mask) for record in records] == [(str(i), tmp_path / "mask.png") for i in range(4)]
+    assert [(record.view, record.mask) for record in records] == [(str(i), folder / "mask.png") for i in range(4)]
+    Image.fromarray(pattern(48, 64, 0)).save(folder / "0.jpg")
+    records, _ = assign_masks(find_photos(tmp_path).records, tmp_path)
+    assert [record.mask is None for record in records] == [True, False, False, False], "one is of another shape"
