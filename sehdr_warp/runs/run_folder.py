@@ -252,7 +252,7 @@ class RunFolder:
                     raise InputError(self.path / name, problem, "put it back as it was, or train again")
             return checkpoint
         if folders != self._checkpoint_folders():  # A running training has written another and removed these.
-            return self.newest_checkpoint(parts)
+            return self.newest_checkpoint(parts, remedy)
         raise newest or InputError(self.checkpoints, "holds no complete checkpoint", remedy)
 
     def read_evidence(self, checkpoint: Checkpoint) -> Evidence | None:
