@@ -172,9 +172,10 @@ def _has_shape(size: tuple[int, int], record: ImageRecord) -> bool:
     width, height = record.lens.width, record.lens.height
     if record.lens is UNPLACED:
         try:
-            width, height = photo_sizes(record.image)[record.oriented]
+            stored, upright = photo_sizes(record.image)
         except InputError:
             return False  # The readers of this photo report what is wrong with it.
+        width, height = upright if record.oriented else stored
     return abs(size[0] * height - size[1] * width) <= max(size)
 
 
