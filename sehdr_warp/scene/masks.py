@@ -148,8 +148,8 @@ def _common_mask(folder: Path, records: Sequence[ImageRecord]) -> tuple[Path, tu
     parents = {record.image.parent for record in records}
     places = [folder, *(place for place in parents if len(parents) == 1 and place.is_relative_to(folder))]
     files = (place / f"{stem}{suffix}" for place in places for stem in _COMMON for suffix in LDR_SUFFIXES)
-    found = (file for file in files if file.is_file() and (file.parent == folder or is_common_mask(file)))
-    if (file := next(found, None)) is None or any(record.image == file for record in records):
+    candidates = (file for file in files if file.is_file() and (file.parent == folder or is_common_mask(file)))
+    if (file := next(candidates, None)) is None or any(record.image == file for record in records):
         return None
     with open_image(resolve_inside(folder, file.relative_to(folder).as_posix(), folder), mask=True) as image:
         return file, image.size

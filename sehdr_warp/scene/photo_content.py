@@ -72,10 +72,10 @@ def frame_notes(photos: Sequence[Path], *, masked: bool = False) -> tuple[str, .
         return (f"{note} lens: bring cameras of COLMAP's OPENCV_FISHEYE, or convert the photos to usual ones",)
     sides = {"top": 0, "right": 1, "bottom": 2, "left": 3}  # Quarter turns that bring a side to the top
     bars = [side for side, turns in sides.items() if _have_bars([np.rot90(codes, turns) for codes in pictures])]
+    if masked or not bars:
+        return ()
     note = f"photos have black bars ({', '.join(bars)}), which become part of the scene"
-    return (f"{note}: crop them off, or leave them out by a mask.png that is black there",) * (
-        bool(bars) and not masked
-    )
+    return (f"{note}: crop them off, or leave them out by a mask.png that is black there",)
 
 
 def _thumbnail(photo: Path) -> np.ndarray:

@@ -118,8 +118,10 @@ def find_photos(folder: Path) -> DataparserOutputs:
         if len(others) > 1 and others[0].parent != photos[0].parent:
             count, names = f"{len(others)} photos of {others[0].parent.name}", first_names([p.name for p in others])
             notes.append(f"{count} are not read, because there are more in {photos[0].parent.name}: {names}")
-    named = {photo.parent for photo in itertools.chain(photos, *candidates)}.union(folder / e for e in IMAGE_FOLDERS)
-    if inner := [each for each in _folders_with_photos(folder) if folder / each not in named]:
+    photo_folders = {photo.parent for photo in itertools.chain(photos, *candidates)}.union(
+        folder / e for e in IMAGE_FOLDERS
+    )
+    if inner := [each for each in _folders_with_photos(folder) if folder / each not in photo_folders]:
         notes.append(f"photos in folders of it are not read: {first_names(inner, 5)}")
     stems = Counter(fold_name(photo.stem) for photo in photos) if together else {}
     views = [f"{photo.parent.name}_" * (stems.get(fold_name(photo.stem), 1) > 1) + photo.stem for photo in photos]

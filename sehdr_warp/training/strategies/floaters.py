@@ -56,9 +56,9 @@ def distances_of_points(views: Sequence[View], points: np.ndarray) -> list[float
     """
     points, distances = every_nth(points, MOST_POINTS), []
     for camera in (view.camera for view in views):
-        shown = points[camera.project(points).inside] if camera.is_pinhole else points[:0]
-        from_camera = np.linalg.norm(shown - camera.position, axis=1)
-        distances.append(float(np.percentile(from_camera, MISMATCHES)) if len(shown) > FEWEST_POINTS else 0.0)
+        in_view = points[camera.project(points).inside] if camera.is_pinhole else points[:0]
+        from_camera = np.linalg.norm(in_view - camera.position, axis=1)
+        distances.append(float(np.percentile(from_camera, MISMATCHES)) if len(in_view) > FEWEST_POINTS else 0.0)
     return distances
 
 

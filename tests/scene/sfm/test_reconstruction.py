@@ -323,7 +323,7 @@ def test_photos_from_one_place_are_told(tmp_path, step):
         Image.fromarray(codes.clip(0, 255).astype(np.uint8)).save(tmp_path / f"{index}.png")
     photos = sorted(tmp_path.glob("*.png"))
     try:
-        told = reconstruct(photos, tmp_path / "cache").notes(photos)[-1]
+        message = reconstruct(photos, tmp_path / "cache").notes(photos)[-1]
     except InputError as error:
-        told = str(error)
-    assert ("as if the camera only turned" if step else "as if taken from one place") in told
+        message = str(error)
+    assert ("as if the camera only turned" if step else "as if taken from one place") in message
