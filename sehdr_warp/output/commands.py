@@ -155,9 +155,20 @@ def _check_render(args: Render) -> None:
         raise UsageError(f"{', '.join(flags)}: set for a film; name it with --video")
     if args.out is None and (flags := changed_flags(args.pictures)):
         raise UsageError(f"{', '.join(flags)}: set for pictures, which only --out writes")
-    # Without the reference white, which needs the scene, and the color space, see above
-    pictures = {k: v for k, v in vars(args.pictures).items() if k not in ("reference_white", "colorspace")}
-    check_options(args.cameras, args.size, **pictures)
+    options = args.pictures
+    check_options(
+        args.cameras,
+        args.size,
+        aovs=options.aovs,
+        evs=options.evs,
+        exposures=options.exposures,
+        pixel=options.pixel,
+        multipart=options.multipart,
+        ldr_brackets=options.ldr_brackets,
+        group_by=options.group_by,
+        ocio=options.ocio,
+        view=options.view,
+    )
     if args.count is not None and args.cameras not in PATHS:
         raise UsageError(f"--count {args.count}: set for an orbit or interpolation; name one with --cameras")
     check_rate(args.film.fps)
