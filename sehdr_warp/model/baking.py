@@ -125,9 +125,11 @@ def _in_colors(
     """Return gaussians_of() in the field's own coordinates, like camera_positions."""
     arrays, to_radiance = _arrays_of(field)
     is_exact = to_radiance is None and color_matrix is None  # But for the unit
-    radiance = to_radiance or (lambda exposure: exposure / field.base_time)
-    if color_matrix is not None:
-        radiance = _in_rec709(radiance, color_matrix, field.white)
+
+    def radiance(colors: np.ndarray) -> np.ndarray:
+        own = to_radiance(colors) if to_radiance else colors / field.base_time
+        return own if color_matrix is None else rec709_of(torch.from_numpy(own), color_matrix, field.white).numpy()
+
     time = exposure_time or field.base_time
     if color_model == "display":
         if arrays.color_model == "display" and time == field.base_time and color_matrix is None:
@@ -144,11 +146,6 @@ def _in_colors(
     if color_model == "linear":
         return bake(arrays, radiance, "linear", camera_positions)
     return bake(arrays, lambda colors: np.log(np.maximum(radiance(colors), DARKEST)), "log", camera_positions)
-
-
-def _in_rec709(native: Colors, matrix: np.ndarray, white: float) -> Colors:
-    """Return a function of colors that converts the radiance of another one to Rec.709."""
-    return lambda colors: rec709_of(torch.from_numpy(np.asarray(native(colors))), matrix, white).numpy()
 
 
 def _arrays_of(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:

@@ -94,8 +94,8 @@ def _clip_to_codes(encoded: np.ndarray) -> np.ndarray:
     return np.clip(np.asarray(encoded, dtype=np.float64), *CODE_RANGE)
 
 
-def rec709_of(radiance: Tensor, matrix: np.ndarray, white: float) -> Tensor:
-    """Convert radiance in a sensor's or a clip's own RGB to linear Rec.709.
+def rec709_of(radiance: Tensor, matrix: np.ndarray | None, white: float) -> Tensor:
+    """Convert radiance in the RGB of the photos, such as a sensor's or a clip's own, to linear Rec.709.
 
     All channels of a sensor clip at the same value, so a pixel clipped in all of them would turn magenta by white
     balance alone. A channel near its white level therefore counts as at least as bright as the brightest of the three
@@ -103,12 +103,14 @@ def rec709_of(radiance: Tensor, matrix: np.ndarray, white: float) -> Tensor:
 
     Args:
         radiance: [..., 3] RGB of the photos.
-        matrix: [3, 3] from that RGB to linear Rec.709, white balance included.
+        matrix: [3, 3] from that RGB to linear Rec.709, white balance included; None if it is linear Rec.709 already.
         white: Radiance at which a channel clips at base exposure: Response.white / base_time.
 
     Returns:
-        [..., 3] linear Rec.709, >= 0.
+        [..., 3] linear Rec.709, >= 0; without a matrix, the radiance itself.
     """
+    if matrix is None:
+        return radiance
     to_rec709 = torch.tensor(matrix, dtype=radiance.dtype, device=radiance.device)
     neutral = torch.linalg.solve(to_rec709, torch.ones_like(to_rec709[0]))
     neutral = neutral / neutral.max()

@@ -105,8 +105,8 @@ class RenderableScene:
         """
         factor = self.samples_across_pixel(camera) if supersample else 1
         finer = camera.resized(factor * camera.width, factor * camera.height)
-        view = as_rec709(self.field.render(finer, degree=self.degree), self.color_matrix, self.field)
-        return view.reduced(factor)
+        view = self.field.render(finer, degree=self.degree)
+        return replace(view, hdr=self.in_rec709(view.hdr)).reduced(factor)
 
     def samples_across_pixel(self, camera: Camera) -> int:
         """Return how many times finer than a camera's pixels render() renders what it averages; at least 1."""
@@ -123,7 +123,7 @@ class RenderableScene:
 
     def in_rec709(self, hdr: Tensor) -> Tensor:
         """Convert radiance [..., 3] from the colors that the scene was trained in to linear Rec.709."""
-        return hdr if self.color_matrix is None else rec709_of(hdr, self.color_matrix, self.field.white)
+        return rec709_of(hdr, self.color_matrix, self.field.white)
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:
         """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base exposure."""
@@ -318,11 +318,6 @@ def on_device(field: RadianceField, device: torch.device, budget: int | None = N
     text = "%d Gaussians do not fit into %.1f GB of %s: those in view are copied to it, far ones at less detail"
     log.info(text, field.gaussians.count, paged.budget / 1e9, device)
     return paged.requires_grad_(False)
-
-
-def as_rec709(rendered: RenderedView, matrix: np.ndarray | None, field: RadianceField) -> RenderedView:
-    """Convert a view of a field to linear Rec.709; `matrix` is Scene.color_matrix, None if its colors are these."""
-    return rendered if matrix is None else replace(rendered, hdr=rec709_of(rendered.hdr, matrix, field.white))
 
 
 def exposure_compensation(info: dict) -> ExposureCompensation | None:

@@ -17,17 +17,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import cache, partial
 
 import torch
 from torch import Tensor
 
 from ..errors import InputError, SehdrError
+from ..model.color_models import rec709_of
 from ..model.radiance_field import RadianceField
 from ..model.renders import RenderedView
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
-from ..runs.run import Run, as_rec709
+from ..runs.run import Run
 from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
 from .data_manager import DataManager, PhotoSampler
@@ -378,7 +380,7 @@ class Trainer:
         """Render the scene as it is now in linear Rec.709; does not count as time of the training."""
         with self.step_runner.on_capture_stream():
             view = self.field.render(camera, degree=self.degree)
-        return as_rec709(view, self.scene.color_matrix, self.field)
+        return replace(view, hdr=rec709_of(view.hdr, self.scene.color_matrix, self.field.white))
 
 
 def sizes_of(scene: Scene, gaussians: int | None = None) -> tuple[int, int, int]:
