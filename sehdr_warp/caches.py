@@ -16,9 +16,9 @@ def usable(folder: Path) -> bool:
         return False
 
 
-def cache_folder(named: Path | str | None = None) -> Path | None:
-    """Return the folder of results: the one that is named, $SEHDR_CACHE or the user's; None if there is none."""
-    folder = named or os.environ.get("SEHDR_CACHE")
+def cache_folder(path: Path | str | None = None) -> Path | None:
+    """Return the folder of results: `path`, $SEHDR_CACHE or the user's; None if there is none."""
+    folder = path or os.environ.get("SEHDR_CACHE")
     return user_cache("sehdr-warp") if folder is None else Path(folder)
 
 

@@ -126,8 +126,8 @@ def run_render(args: Render) -> None:
         film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}
         files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
         if len(cameras) == 1:
-            chosen = args.camera or args.cameras
-            log.warning("%s: '%s' is one camera, so one frame; --cameras orbit is a path", args.video, chosen)
+            selector = args.camera or args.cameras
+            log.warning("%s: '%s' is one camera, so one frame; --cameras orbit is a path", args.video, selector)
         seconds = len(cameras) / fps
         summary = summary or f"{args.video}: {len(cameras)} frame{'s' * (len(cameras) > 1)}, {seconds:.3g} s"
     print(json.dumps({"files": [str(path) for path in files]}) if args.json else summary)

@@ -21,12 +21,12 @@ _POLICY = "default-src 'none'; script-src {}; style-src 'unsafe-inline'; img-src
 _POLICY += "form-action 'none'"
 
 
-def markup(template: str, *values: Any, **named: Any) -> Markup:
+def markup(template: str, *values: Any, **keywords: Any) -> Markup:
     """Return a template of HTML with values in its fields, as of str.format; text is escaped, Markup is not.
 
     template: a literal, never text from outside.
     """
-    return Markup(template).format(*values, **named)
+    return Markup(template).format(*values, **keywords)
 
 
 def join(parts: Iterable[Any], separator: str = "") -> Markup:

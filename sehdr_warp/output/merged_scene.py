@@ -100,5 +100,5 @@ def _joined_gaussians(scenes: Sequence[RenderableScene], moves: Sequence[WorldTr
 
 def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
     """Return tensors [N] of all scenes as one on the CPU; None if one is missing."""
-    known = [part.cpu() for part in parts if part is not None]
-    return torch.cat(known) if len(known) == len(parts) else None
+    tensors = [part.cpu() for part in parts if part is not None]
+    return torch.cat(tensors) if len(tensors) == len(parts) else None

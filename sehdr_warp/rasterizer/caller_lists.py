@@ -147,7 +147,7 @@ def contributions(
     size, (height, width), device = lists.tile_size, transmittance.shape, transmittance.device
     lengths = (lists.ends - lists.starts).flatten()
     corners = torch.arange(size, device=device)
-    found = [torch.zeros(2, 0, dtype=torch.int64, device=device)]
+    pairs = [torch.zeros(2, 0, dtype=torch.int64, device=device)]
     order = lengths.argsort()[int((lengths <= 0).sum()) :]  # Tiles with lists of about one length together
     at = 0
     while at < len(order):
@@ -170,7 +170,7 @@ def contributions(
         pixels = y.clamp_max(height - 1) * width + x.clamp_max(width - 1)
         left = torch.where(counts, 1 - alphas, 1.0).cumprod(1) * transmittance.flatten()[pixels]
         tile, place, pixel = (counts & (left > TRANSMITTANCE_MIN)).nonzero(as_tuple=True)
-        found.append(torch.stack([rows[tile, place], pixels[tile, 0, pixel]]))
-    gaussians, pixels = torch.cat(found, 1)
+        pairs.append(torch.stack([rows[tile, place], pixels[tile, 0, pixel]]))
+    gaussians, pixels = torch.cat(pairs, 1)
     order = pixels.argsort(stable=True)
     return gaussians[order], pixels[order]

@@ -70,11 +70,11 @@ def as_config(config: object) -> Config | None:
         return load_config(config)
     if isinstance(config, Mapping):
         changed = override_config(Config(), dict(config), "overrides")
-        stated = set(changed.plan.keep)
+        fields = set(changed.plan.keep)
         for path, value in config.items():
             table = value.model_dump(exclude_unset=True) if isinstance(value, BaseModel) else value
-            stated |= {f"{path}.{name}" for name in table} if isinstance(table, Mapping) else {path}
-        user_fields = {path for path in stated if not path.startswith("plan.")}
+            fields |= {f"{path}.{name}" for name in table} if isinstance(table, Mapping) else {path}
+        user_fields = {path for path in fields if not path.startswith("plan.")}
         return override_config(changed, {"plan.keep": sorted(user_fields)})
     raise InputError("config", f"is {type(config).__name__}", "pass a preset's name, a dict of fields or a Config")
 

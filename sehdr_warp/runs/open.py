@@ -128,8 +128,8 @@ def load_run_scene(run: Run, data: str | None) -> Scene:
 def _name_changed_photos(scene: Scene, run: Run, place: str) -> None:
     """Warn if photos are not those that a run was trained with, by the signatures in its scene.json."""
     saved = {view["name"]: view["photo"] for view in run.folder.read_scene()["views"]}
-    found = {view.name: photo_signature(view.codes, view.mask) for view in scene.views if view.name in saved}
-    if changed := changed_photos(saved, found):
+    current = {view.name: photo_signature(view.codes, view.mask) for view in scene.views if view.name in saved}
+    if changed := changed_photos(saved, current):
         text = "%s: %d of %d photos are other pictures than in the training of %s (or have other masks): %s"
         log.warning(text, place, len(changed), len(scene.views), run.path, first_names(changed))
 

@@ -166,11 +166,11 @@ def in_world_of_run(
     u, _, vt = np.linalg.svd(turns.sum(0))
     turn = u @ vt
     cosines = (np.einsum("nij,ij->n", turns, turn) - 1) / 2
-    found, known = np.stack([(turn @ new.position, old.position) for new, old in pairs], axis=1)
-    spread = np.linalg.norm(found - found.mean(0))
-    scale = np.linalg.norm(known - known.mean(0)) / spread if spread else 1.0
-    shift = known.mean(0) - scale * found.mean(0)
-    distances = np.linalg.norm(scale * found + shift - known, axis=1) / unit
+    positions, targets = np.stack([(turn @ new.position, old.position) for new, old in pairs], axis=1)
+    spread = np.linalg.norm(positions - positions.mean(0))
+    scale = np.linalg.norm(targets - targets.mean(0)) / spread if spread else 1.0
+    shift = targets.mean(0) - scale * positions.mean(0)
+    distances = np.linalg.norm(scale * positions + shift - targets, axis=1) / unit
     unlike |= (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED)
     if unlike.any():
         problem = f"{unlike.sum()} of {len(views)} photos have other cameras than {run} was trained with"

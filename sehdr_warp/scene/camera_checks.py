@@ -1,6 +1,6 @@
 """Checks of a set's cameras against each other, its points and its photos: what other tools often state wrongly."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -79,24 +79,22 @@ def _wrong_way(records: Sequence[ImageRecord], cloud: PointCloud) -> list[str]:
         return []
     points = cloud.positions[:: max(1, len(cloud.positions) // _MOST_POINTS)]
 
-    def shown(poses: list[np.ndarray]) -> float:
-        return float(np.mean([_shown(record.lens, pose, points) for record, pose in zip(judged, poses, strict=True)]))
+    def mean_share(read: Callable[[np.ndarray], np.ndarray]) -> float:
+        return float(np.mean([_share_in_frame(each.lens, read(each.world_to_camera), points) for each in judged]))
 
-    stated = shown([record.world_to_camera for record in judged])
+    own_share = mean_share(lambda pose: pose)
     others = {
-        "inverted (camera-to-world and world-to-camera exchanged)": shown(
-            [np.linalg.inv(record.world_to_camera) for record in judged]
-        ),
-        "in other axes (OpenCV's and OpenGL's exchanged)": shown([_FLIP @ record.world_to_camera for record in judged]),
+        "inverted (camera-to-world and world-to-camera exchanged)": mean_share(np.linalg.inv),
+        "in other axes (OpenCV's and OpenGL's exchanged)": mean_share(lambda pose: _FLIP @ pose),
     }
     reading, share = max(others.items(), key=lambda item: item[1])
-    if share < 3 * stated + 0.1:
+    if share < 3 * own_share + 0.1:
         return []
-    problem = f"the photos show {100 * stated:.0f} % of the set's points, and {100 * share:.0f} % if poses are read"
+    problem = f"the photos show {100 * own_share:.0f} % of the set's points, and {100 * share:.0f} % if poses are read"
     return [f"poses: {problem} {reading}: export them again if training fails"]
 
 
-def _shown(lens: Lens, pose: np.ndarray, points: np.ndarray) -> float:
+def _share_in_frame(lens: Lens, pose: np.ndarray, points: np.ndarray) -> float:
     """Return the part of points [P, 3] that lies in the frame of a lens without its distortion."""
     x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
     z = np.where(z > 0, z, np.nan)

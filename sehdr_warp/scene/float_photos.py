@@ -27,13 +27,13 @@ def with_float_times(records: Sequence[ImageRecord], folder: Path) -> tuple[list
     averages = _log_averages([record.image for record in records])
     stated, notes = stated_times(records, folder)
     times = [exr_exposure_time(record.image) if time is None else time for record, time in zip(records, stated)]
-    known = [time for time in times if time is not None]
+    own_times = [time for time in times if time is not None]
     factors, meaning = [1.0] * len(records), "taken as light, at no exposure"
-    if len(known) == len(times) and max(known) >= min(known) * 1.001:
-        span, values = f"{min(known):g} to {max(known):g} s", np.array(list(averages.values()))
+    if len(own_times) == len(times) and max(own_times) >= min(own_times) * 1.001:
+        span, values = f"{min(own_times):g} to {max(own_times):g} s", np.array(list(averages.values()))
         # Whether images become more alike if their values are divided by their times
-        if None in stated or np.std(values - np.log([known[index] for index in averages])) <= np.std(values):
-            factors = [time / known[0] for time in known]
+        if None in stated or np.std(values - np.log([own_times[index] for index in averages])) <= np.std(values):
+            factors = [time / own_times[0] for time in own_times]
             meaning = f"light times {'expTime' if None in stated else 'the stated times'}, {span}"
         else:
             meaning = f"taken as light, because they do not follow the stated times, {span}"

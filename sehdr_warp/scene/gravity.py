@@ -147,11 +147,11 @@ def up_from_lines(views: Sequence[View], up: np.ndarray) -> np.ndarray | None:
         views: Photos of pinhole cameras.
         up: Direction nearby, from up_direction.
     """
-    chosen = every_nth(views, _LINE_PHOTOS)
-    parts = [_edge_planes(view) for view in chosen]
+    sample = every_nth(views, _LINE_PHOTOS)
+    parts = [_edge_planes(view) for view in sample]
     normals, weights = (np.concatenate(each) for each in zip(*parts, strict=True))
     near = np.abs(normals @ up) < math.sin(math.radians(_CONE))
-    normals, weights = normals[near], weights[near] / len(chosen)
+    normals, weights = normals[near], weights[near] / len(sample)
     cameras = [upright_camera(view) for view in views]
     level = _level_axes(_rotations(cameras), up)
 

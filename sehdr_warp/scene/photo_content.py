@@ -47,11 +47,11 @@ def unused_bits_note(largest: int, *, linear: bool) -> list[str]:
         largest: as the views store it, 0 without such photos.
         linear: the files' codes are proportional to light, and the views' are encoded by sRGB's curve.
     """
-    stated = round(float(srgb_to_linear(np.array(largest / 65535))) * 65535) if linear else largest
-    bits = stated.bit_length()
-    if not 8 < bits <= _MOST_BITS_UNSCALED or stated < _NEARLY_WHITE * 2**bits:
+    highest = round(float(srgb_to_linear(np.array(largest / 65535))) * 65535) if linear else largest
+    bits = highest.bit_length()
+    if not 8 < bits <= _MOST_BITS_UNSCALED or highest < _NEARLY_WHITE * 2**bits:
         return []
-    note = f"no code of the 16-bit photos is above {stated}: if they hold {bits} bits"
+    note = f"no code of the 16-bit photos is above {highest}: if they hold {bits} bits"
     return [f"{note}, what clips there counts as measured; multiply their codes by {2 ** (16 - bits)}"]
 
 

@@ -113,12 +113,12 @@ def _lens(lens: Lens, verdict: _Verdict) -> Lens:
 
 def _readings(layout: str) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
     """Yield readings of what a file states, by name: from the pose that was read to the pose that is meant."""
-    stated = _FILE_AXES.get(layout)
+    file_axes = _FILE_AXES.get(layout)
 
     def in_file(pose: np.ndarray) -> np.ndarray:
-        if stated is None:
+        if file_axes is None:
             return pose
-        return np.linalg.inv(pose) @ _pose(_AXES[stated], np.zeros(3))
+        return np.linalg.inv(pose) @ _pose(_AXES[file_axes], np.zeros(3))
 
     for name, axes in _AXES.items():
         kinds = {
@@ -156,28 +156,28 @@ def _with_quaternion_last(pose: np.ndarray) -> np.ndarray:
 
 def _verdict(records: Sequence[ImageRecord], layout: str, pairs: Sequence[tuple[int, int]]) -> _Verdict:
     shared: list[SharedPixels] = []
-    stated: list[float] = []
+    distances: list[float] = []
     for each in shared_pixels(records, pairs):
         shared.append(each)
-        stated += _distances(records, [each])
-        fitting = sorted(stated)[:_SURE_PAIRS]
-        if len(fitting) == _SURE_PAIRS and fitting[-1] < _FITS and np.median(stated) < _EXACT:
+        distances += _distances(records, [each])
+        fitting = sorted(distances)[:_SURE_PAIRS]
+        if len(fitting) == _SURE_PAIRS and fitting[-1] < _FITS and np.median(distances) < _EXACT:
             return _Verdict()
         if len(shared) == _MOST_PAIRS:
             break
-    miss = float(np.median(stated)) if stated else 0.0
-    if len(stated) < _FEWEST_PAIRS or miss < _EXACT:
+    miss = float(np.median(distances)) if distances else 0.0
+    if len(distances) < _FEWEST_PAIRS or miss < _EXACT:
         return _Verdict()
     file = records[0].lens.source.name.replace("cameras.", "images.")  # Of COLMAP, which states poses there
     far = f"pixels that two photos share lie {miss:.1f} pixels beside where {file} puts them"
     if miss == np.inf:
         far = f"{file} puts points that two photos share behind the cameras"
-    lens, found = _best_lens(records, shared)
-    if not lens.as_stated and np.median(found) * _LEAST_GAIN < miss and _fit(found):
+    lens, residuals = _best_lens(records, shared)
+    if not lens.as_stated and np.median(residuals) * _LEAST_GAIN < miss and _fit(residuals):
         first = records[0].lens
         other = f"a focal length of {lens.focal * first.focal[0]:.0f} in place of {first.focal[0]:.0f} pixels"
         what = " and ".join([other] * (lens.focal != 1) + ["no distortion"] * (not lens.distorted))
-        fit = f"which fits the photos ({np.median(found):.1f} pixels)"
+        fit = f"which fits the photos ({np.median(residuals):.1f} pixels)"
         return replace(lens, note=f"lens: {far}; it is read with {what}, {fit}")
     if miss < _MISSES:
         return _Verdict()
@@ -205,7 +205,7 @@ def _best_lens(records: Sequence[ImageRecord], shared: Sequence[SharedPixels]) -
         return best
     off_center = max(abs(lens.centre[0] / lens.width - 0.5), abs(lens.centre[1] / lens.height - 0.5)) > _OFF_CENTER
 
-    def found(focal: float, kind: _Verdict) -> list[float]:
+    def distances_at(focal: float, kind: _Verdict) -> list[float]:
         try:
             return _distances(records, shared, verdict=replace(kind, focal=float(focal)))
         except InputError:  # No lens is so short or so long.
@@ -214,8 +214,8 @@ def _best_lens(records: Sequence[ImageRecord], shared: Sequence[SharedPixels]) -
     for whole in (False, True)[: 1 + off_center]:
         for distorted in (True, False)[: 2 - lens.is_pinhole]:
             kind = _Verdict(whole=whole, distorted=distorted)
-            for focal in (1.0, _best_focal(lambda focal, kind=kind: _typical(found(focal, kind)))):
-                distances = found(focal, kind)
+            for focal in (1.0, _best_focal(lambda focal, kind=kind: _typical(distances_at(focal, kind)))):
+                distances = distances_at(focal, kind)
                 unchanged = 0 < abs(focal - 1) < _LEAST_CHANGE
                 if not unchanged and _CLEARLY * _typical(distances) < _typical(best[1]):
                     best = replace(kind, focal=focal), distances
@@ -228,8 +228,8 @@ def _best_focal(distance: Callable[[float], float]) -> float:
 
     nearest = int(np.argmin([distance(float(focal)) for focal in _FOCAL_LENGTHS]))
     low, high = _FOCAL_LENGTHS[[max(nearest - 1, 0), min(nearest + 1, len(_FOCAL_LENGTHS) - 1)]]
-    found = minimize_scalar(distance, bounds=(low, high), method="bounded", options={"xatol": 1e-3 * low})
-    return float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
+    minimum = minimize_scalar(distance, bounds=(low, high), method="bounded", options={"xatol": 1e-3 * low})
+    return float(minimum.x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _typical(distances: Sequence[float]) -> float:

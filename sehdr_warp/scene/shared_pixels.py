@@ -104,11 +104,11 @@ def _small_photo(record: ImageRecord) -> tuple[Lens, np.ndarray, np.ndarray] | N
         with open_image(record.image) as image:
             if image.mode not in ("L", "RGB", "RGBA", "P"):
                 return None
-            stated = orientation_of(image)
-            turned = oriented and stated in (5, 6, 7, 8)
+            file_orientation = orientation_of(image)
+            turned = oriented and file_orientation in (5, 6, 7, 8)
             image.draft("L", (lens.height, lens.width) if turned else (lens.width, lens.height))
             grey = image.convert("RGB").convert("L")
-            turn = turn_of_loaded(image, stated, oriented=oriented)
+            turn = turn_of_loaded(image, file_orientation, oriented=oriented)
             size = (lens.height, lens.width) if turn in (5, 6, 7, 8) else (lens.width, lens.height)
             grey = grey.resize(size, Image.Resampling.BOX)
         mask = np.ones((lens.height, lens.width), bool)

@@ -136,11 +136,11 @@ def _zstandard_streams(path: Path, data: bytes, streams: int, sizes: list[int]) 
         (start,) = struct.unpack_from("<I", data, _STREAMS_AT)
         begin = start + 16 * streams
         for index, size in enumerate(sizes):
-            packed, stated = struct.unpack_from("<QQ", data, start + 16 * index)
-            if stated != size or size > _MOST_PER_BYTE * len(data):
-                raise InputError(path, f"states {stated} bytes for stream {index}, of {size}", _DAMAGED)
-            blocks.append(codec.zstd_decode(data[begin : begin + packed], out=size))
-            begin += packed
+            packed_size, full_size = struct.unpack_from("<QQ", data, start + 16 * index)
+            if full_size != size or size > _MOST_PER_BYTE * len(data):
+                raise InputError(path, f"states {full_size} bytes for stream {index}, of {size}", _DAMAGED)
+            blocks.append(codec.zstd_decode(data[begin : begin + packed_size], out=size))
+            begin += packed_size
     except (struct.error, RuntimeError) as error:
         raise InputError(path, f"is damaged SPZ ({error!s:.80})", _DAMAGED) from None
     return b"".join(blocks)

@@ -245,13 +245,13 @@ def _changed_light(compensation: ExposureCompensation, views: Sequence[View]) ->
     """
     stops = np.log2([compensation.gains[view.name][1] for view in views])
     off = stops - np.median(stops)
-    named = [i for i in np.argsort(-np.abs(off), kind="stable") if abs(off[i]) >= CHANGED_LIGHT]
-    if not named:
+    changed = [i for i in np.argsort(-np.abs(off), kind="stable") if abs(off[i]) >= CHANGED_LIGHT]
+    if not changed:
         return ""
-    names = first_names([f"{views[i].name} {off[i]:+.1f}" for i in named])
+    names = first_names([f"{views[i].name} {off[i]:+.1f}" for i in changed])
     return (
-        f"; {counted(len(named), 'photo is', 'photos are')} brighter or darker than stated (stops: {names}), as where "
-        "clouds pass or a camera brightens by itself"
+        f"; {counted(len(changed), 'photo is', 'photos are')} brighter or darker than stated (stops: {names}), as "
+        "where clouds pass or a camera brightens by itself"
     )
 
 

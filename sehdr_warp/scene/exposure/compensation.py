@@ -299,9 +299,9 @@ def _measured_lenses(views: Sequence[View], light: np.ndarray, radius: np.ndarra
 
 def _reach(lenses: np.ndarray, light: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Return the reach [V] of the points of each photo's lens, see unmeasured_reach(); 1 without points or a lens."""
-    reach, known = np.ones(len(lenses)), np.asarray(np.isfinite(light).any(2))
+    reach, has_light = np.ones(len(lenses)), np.asarray(np.isfinite(light).any(2))
     for lens in set(lenses) - {-1}:
-        distances = radius[lenses == lens][known[lenses == lens]]
+        distances = radius[lenses == lens][has_light[lenses == lens]]
         if distances.size:
             reach[lenses == lens] = np.percentile(distances, 95)
     return reach

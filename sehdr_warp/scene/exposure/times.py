@@ -161,14 +161,14 @@ def _listed_times(records: Sequence[ImageRecord], source: Path) -> tuple[dict[Pa
         spellings = {name: _spellings(name) for name in table}
         entries = {each: name for name, ways in reversed(spellings.items()) for each in reversed(ways)}
         entries |= {ways[0]: name for name, ways in spellings.items()}
-        known = set()
+        photo_spellings = set()
         for record in records:
             names = [*photo_names.of(record), *names_below(record.image, [place])]
-            known.update(names)
+            photo_spellings.update(names)
             if entry := next((entries[name] for name in names if name in entries), None):
                 times[record.image] = table[entry]
         strange, ambiguous = [], []
-        for name in (name for name, ways in spellings.items() if known.isdisjoint(ways)):
+        for name in (name for name, ways in spellings.items() if photo_spellings.isdisjoint(ways)):
             if images := next(filter(None, map(photo_names.sharing, spellings[name])), None):
                 two = ", ".join(image.relative_to(photo_names.bases[0]).as_posix() for image in images[:2])
                 ambiguous.append(f"{name:.90} ({two})")
@@ -225,11 +225,11 @@ def _exif_times(records: Sequence[ImageRecord], stated: Sequence[float | None]) 
     """
     exposures = [exif_exposure(record.image) for record in records]
     times = [exposure.time for exposure in exposures]
-    known = sum(time is not None or own is not None for time, own in zip(stated, times, strict=True))
-    timeless = known == 0
+    timed_count = sum(time is not None or own is not None for time, own in zip(stated, times, strict=True))
+    timeless = timed_count == 0
     notes, factors = [], [1.0] * len(records)
     settings = (("ISO", "iso", 1.0), ("f-number", "f_number", -2.0))
-    for name, field, power in settings if timeless or 2 * known > len(records) else ():
+    for name, field, power in settings if timeless or 2 * timed_count > len(records) else ():
         relevant = [i for i, exposure in enumerate(exposures) if timeless or exposure.time is not None]
         values = [value for i in relevant if (value := getattr(exposures[i], field)) is not None]
         if len(set(values)) <= 1:

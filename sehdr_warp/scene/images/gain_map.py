@@ -65,18 +65,18 @@ class GainMap:
 
     def light(self, base: np.ndarray) -> np.ndarray:
         """Return the light [H, W, 3] float32 of a photo whose own light [H, W, 3] is in [0, 1], 1 at white."""
-        stated = self.parameters
+        parameters = self.parameters
         guide = np.sqrt(base @ np.full(3, 1 / 3, np.float32))  # Even steps for the eye, about
         planes = [np.clip(_at_size_of(guide, plane), 0, 1) for plane in np.moveaxis(self.encoded, 2, 0)]
         if self.to_alternate is not None:
             base = base @ self.to_alternate.T.astype(np.float32)
         result = np.empty(base.shape, np.float32)
         for channel in range(3):
-            share = planes[min(channel, len(planes) - 1)] ** np.float32(1 / stated.gamma[channel])
-            span = stated.maximum[channel] - stated.minimum[channel]
-            gain = np.exp2(np.float32(stated.minimum[channel]) + np.float32(span) * share)
-            light = (base[..., channel] + np.float32(stated.base_offset[channel])) * gain
-            result[..., channel] = light - np.float32(stated.alternate_offset[channel])
+            share = planes[min(channel, len(planes) - 1)] ** np.float32(1 / parameters.gamma[channel])
+            span = parameters.maximum[channel] - parameters.minimum[channel]
+            gain = np.exp2(np.float32(parameters.minimum[channel]) + np.float32(span) * share)
+            light = (base[..., channel] + np.float32(parameters.base_offset[channel])) * gain
+            result[..., channel] = light - np.float32(parameters.alternate_offset[channel])
         if self.to_alternate is not None:
             result = result @ np.linalg.inv(self.to_alternate).T.astype(np.float32)
         return np.maximum(result, 0)

@@ -105,9 +105,9 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
             with (
                 silent_stderr() if image.format == "TIFF" else nullcontext()
             ):  # libtiff prints of what it cannot decode.
-                stated = orientation_of(image) if image.format == "TIFF" else 1
+                file_orientation = orientation_of(image) if image.format == "TIFF" else 1
                 pixels, alpha = _decode(image, path)
-            turn = turn_of_loaded(image, stated, oriented=oriented)
+            turn = turn_of_loaded(image, file_orientation, oriented=oriented)
         except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
     return EncodedImage(turn_upright(pixels, turn), None if alpha is None else turn_upright(alpha, turn))
@@ -316,15 +316,15 @@ def orientation_of(image: Image.Image) -> int:
         return 1
 
 
-def turn_of_loaded(image: Image.Image, stated: int, *, oriented: bool) -> int:
+def turn_of_loaded(image: Image.Image, file_orientation: int, *, oriented: bool) -> int:
     """Return the turn, as of turn_upright(), of loaded pixels to upright ones if `oriented`, else to those in the file.
 
-    `stated` is orientation_of() a TIFF before: Pillow turns its pixels, mostly, and then takes out the orientation.
+    `file_orientation` is orientation_of() a TIFF before Pillow loads it, which turns most TIFFs and removes the tag.
     """
     left = orientation_of(image)
     if oriented:
         return left
-    return {6: 8, 8: 6}.get(stated, stated) if image.format == "TIFF" and left == 1 else 1
+    return {6: 8, 8: 6}.get(file_orientation, file_orientation) if image.format == "TIFF" and left == 1 else 1
 
 
 def png16(codes: np.ndarray, exif: bytes | None = None, level: int = -1) -> bytes:

@@ -106,8 +106,8 @@ def find_photos(folder: Path) -> DataparserOutputs:
     notes += maps_note(maps)
     if together:
         counts = Counter(photo.parent for photo in photos)
-        taken = ", ".join(f"{place} ({counts[folder / place]})" for place in together)
-        notes.append(f"photos are read from the folders of one camera: {taken}")
+        folders = ", ".join(f"{place} ({counts[folder / place]})" for place in together)
+        notes.append(f"photos are read from the folders of one camera: {folders}")
     if model := find_model(folder, anywhere=True):
         place = model.relative_to(folder).as_posix()
         notes.append(f"the COLMAP model in {place} names none of these photos and is not used")

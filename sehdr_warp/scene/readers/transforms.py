@@ -114,8 +114,8 @@ class _Frames:
             image, hdr = photo_and_truth(image)
             lens = frame_lens(values, frame, image, path)
             mask = _mask_file(folder, frame["mask_path"], path) if frame.get("mask_path") else None
-            stated = ((fields[key], unit) for key, unit in _TIMES.items() if fields.get(key) is not None)
-            time, unit = next(stated, (None, ""))
+            times = ((fields[key], unit) for key, unit in _TIMES.items() if fields.get(key) is not None)
+            time, unit = next(times, (None, ""))
             try:
                 seconds = None if time is None else parse_seconds(time, path, name, unit)
             except InputError as error:
@@ -226,8 +226,8 @@ def _frame_images(folder: Path, names: Sequence[str], path: Path) -> dict[str, P
     if inner := image_folder(folder):
         return find_images(inner, names, path)
     beside = {name: _frame_image(folder, PureWindowsPath(name).name, path) for name in names}
-    found = [image for image in beside.values() if image is not None]
-    return beside if len(set(found)) == len(found) else images
+    images_beside = [image for image in beside.values() if image is not None]
+    return beside if len(set(images_beside)) == len(images_beside) else images
 
 
 def _frame_image(folder: Path, name: str, path: Path) -> Path | None:

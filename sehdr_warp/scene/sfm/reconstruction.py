@@ -71,8 +71,8 @@ class Reconstruction:
         names = photo_labels(photos)
         if unregistered:
             were = f"photos could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out"
-            count, lost = f"{len(unregistered)} of {len(photos)}", all_names(names, unregistered)
-            notes.append(f"{count} {were}: {lost}; photos between these and the others help")
+            count, names_left_out = f"{len(unregistered)} of {len(photos)}", all_names(names, unregistered)
+            notes.append(f"{count} {were}: {names_left_out}; photos between these and the others help")
         if self.weak:
             shared = "few points with others, so"
             few = counted(
