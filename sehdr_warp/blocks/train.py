@@ -103,7 +103,7 @@ def _check(out: Path, *, resume: bool, overwrite: bool) -> bool:
         refuse_links(out / name, out)
     if is_in_blocks(out) and (resume or overwrite):
         return resume
-    RunWriter(out).prepare(resume=False, overwrite=overwrite)
+    RunWriter(out).check_start(resume=False, overwrite=overwrite)
     return False
 
 

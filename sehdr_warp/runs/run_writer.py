@@ -48,7 +48,7 @@ class RunWriter(RunFolder):
     """
 
     def __init__(self, path: Path | str):
-        """Name the files of a run; prepare(), lock() and begin() create them."""
+        """Name the files of a run; lock() and begin() create them."""
         super().__init__(path)
         self._lock = FileLock(self.path / _LOCK, thread_local=False)
         self._lock_identity: tuple[int, int] | None = None
@@ -81,8 +81,10 @@ class RunWriter(RunFolder):
                     (self.path / _LOCK).unlink()
                     self.path.rmdir()
 
-    def prepare(self, *, resume: bool, overwrite: bool) -> bool:
-        """Finish what a killed training had begun here; return whether there is a run to continue.
+    def check_start(self, *, resume: bool, overwrite: bool) -> bool:
+        """Check that a training may start here, and return whether it continues a run.
+
+        A run that a killed training had begun to replace is replaced first.
 
         Raises InputError if the folder holds something other than a run, if neither resume nor overwrite was asked
         for, or if another training is at work in it.
@@ -144,7 +146,7 @@ class RunWriter(RunFolder):
             require_text(name)
         require_readable(data)
         self.lock()
-        self.prepare(resume=False, overwrite=overwrite)  # Reading the photos took time.
+        self.check_start(resume=False, overwrite=overwrite)  # Another training may have begun here meanwhile.
         info = {"scene": scene.name, "data": data}
         info |= {"base_time": field.base_time, "response": field.response.to_dict()}
         info["normalization"] = field.normalization.to_dict()

@@ -189,7 +189,7 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
     assert out is not None, "run_train() refuses it"
     # What can be refused is refused before the photos are read, which may take minutes.
     folder = RunWriter(out)
-    resumes = folder.prepare(resume=output.resume, overwrite=output.overwrite)
+    resumes = folder.check_start(resume=output.resume, overwrite=output.overwrite)
     if output.resume and not resumes:
         log.info("%s holds no run yet: a training begins there", out)
     info, saved_config = folder.read_info() if resumes else {}, folder.read_config() if resumes else None

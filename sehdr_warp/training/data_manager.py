@@ -57,8 +57,8 @@ class DataManager:
             return None
         return [estimate.log_light for estimate in self.light_estimates]
 
-    def prepare(self, iteration: int) -> None:
-        """Prepare the targets of an iteration: late in a training, bright codes are intervals, see INTERVALS_FROM."""
+    def update_targets(self, iteration: int) -> None:
+        """Treat bright codes as intervals if the iteration is late in the training, see INTERVALS_FROM."""
         if iteration > INTERVALS_FROM * self._config.schedule.iterations and not self._uses_intervals:
             self._uses_intervals = True
             self._dataset.scale.use_intervals()

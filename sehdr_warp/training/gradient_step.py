@@ -155,7 +155,7 @@ class GradientStep:
         """Prepare what the step of an iteration reads or adds to: in a capture, it would lie in the graph's memory."""
         self._dropout.draw(iteration, self.field.gaussians.row_count)
         if options.needs_means2d_grad:
-            self.strategy.prepare(self.field.gaussians.row_count, self.step_counters.device)
+            self.strategy.allocate(self.field.gaussians.row_count, self.step_counters.device)
 
     def run(self, view: TrainingView, options: StepOptions, max_intersections: int | None = None) -> StepResult:
         """Take a step on a view; arguments as of compute_gradients()."""

@@ -103,7 +103,7 @@ def create_trainer(
         summary_writer()
     folder = RunWriter(out)
     with oom_context(device, lambda: sizes_of(scene), TRAINING_REMEDY):
-        has_run = folder.prepare(resume=resume, overwrite=overwrite)  # Again, for those who call this function.
+        has_run = folder.check_start(resume=resume, overwrite=overwrite)
         try:
             if has_run:
                 if config is not None and not states_iterations:

@@ -234,7 +234,7 @@ class Trainer:
         # Photo, learning rates and options. The last step may have more photos than iterations are left.
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
-        self.data_manager.prepare(self.iteration)
+        self.data_manager.update_targets(self.iteration)
         self._view_index = self.sampler.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)

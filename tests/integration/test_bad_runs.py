@@ -154,6 +154,6 @@ def test_nothing_is_replaced(embedded_run, tmp_path, capfd):
 def test_a_folder_that_is_no_run_is_not_replaced_and_the_remedy_says_so(tmp_path):
     (tmp_path / "report.html").write_text("mine")
     with pytest.raises(InputError, match="is not a run .*; choose another folder for the run"):
-        RunWriter(tmp_path).prepare(resume=False, overwrite=True)
+        RunWriter(tmp_path).check_start(resume=False, overwrite=True)
     with pytest.raises(InputError, match="is not a run .*; give the folder that"):
-        RunWriter(tmp_path).prepare(resume=True, overwrite=False)
+        RunWriter(tmp_path).check_start(resume=True, overwrite=False)

@@ -60,7 +60,7 @@ def test_a_link_is_refused_even_to_a_sound_file(run, name):
         read_all(run)
     for how in ({"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}):
         with pytest.raises(InputError, match="is a link"):
-            RunWriter(run).prepare(**how)
+            RunWriter(run).check_start(**how)
     assert files_in(run.parent) == before
 
 
@@ -76,7 +76,7 @@ def test_links_in_place_of_an_interrupted_write_move_nothing(run, name, place):
     before = files_in(run.parent)
     for act in (
         lambda: read_all(run),
-        lambda: RunWriter(run).prepare(resume=True, overwrite=False),
+        lambda: RunWriter(run).check_start(resume=True, overwrite=False),
         lambda: RunWriter(run).lock(),
     ):
         with pytest.raises(InputError, match="is a link"):
@@ -94,7 +94,7 @@ def test_only_a_training_finishes_an_interrupted_write(run):
     shutil.move(other, run / ".new")
     before = files_in(run)
     assert read_all(run)[1] == SUMMARY and files_in(run) == before
-    assert RunWriter(run).prepare(resume=True, overwrite=False)
+    assert RunWriter(run).check_start(resume=True, overwrite=False)
     assert not (run / ".new").exists() and RunFolder(run).read_summary() == {}
     load_run(run)
 
@@ -112,7 +112,7 @@ def test_another_programs_folder_of_that_name_is_left_alone(tmp_path):
     before = files_in(tmp_path)
     for how in ({"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}):
         with pytest.raises(InputError, match=r"thesis\.txt: lies in the folder of a new run"):
-            RunWriter(tmp_path).prepare(**how)
+            RunWriter(tmp_path).check_start(**how)
     assert {name: text for name, text in files_in(tmp_path).items() if name != ".lock"} == before
 
 
@@ -217,7 +217,7 @@ def test_a_lock_that_was_removed_stops_the_writer(run):
 
 def test_resume_begins_where_nothing_was_begun(tmp_path):
     for folder in (tmp_path, tmp_path / "missing"):
-        assert not RunWriter(folder).prepare(resume=True, overwrite=False)
+        assert not RunWriter(folder).check_start(resume=True, overwrite=False)
 
 
 def test_confidence_is_the_same_file_each_time(run):
@@ -302,5 +302,5 @@ def test_names_that_are_no_text_are_refused_before_the_training(tmp_path, where)
 def test_a_place_that_cannot_be_written_is_refused_before_the_photos_are_read(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
     with pytest.raises(InputError, match=f"cannot be written, because {tmp_path} is read-only"):
-        RunWriter(tmp_path / "runs" / "first").prepare(resume=False, overwrite=False)
+        RunWriter(tmp_path / "runs" / "first").check_start(resume=False, overwrite=False)
     assert not list(tmp_path.iterdir())

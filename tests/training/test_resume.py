@@ -126,7 +126,7 @@ def test_a_run_is_replaced_whole_or_not_at_all(scene, trained, tmp_path, monkeyp
         try:
             run = load_run(copy)
         except InputError:  # Half replaced: readers change nothing, and the next training finishes it.
-            RunWriter(copy).prepare(resume=True, overwrite=False)
+            RunWriter(copy).check_start(resume=True, overwrite=False)
             run = load_run(copy)
             assert run.config.seed == 5
         ends.append((run.config.seed, run.iterations))

@@ -48,14 +48,14 @@ def adc_strategy(**options):
 def observe(strategy, gradients):
     """Screen gradients along x, in normalised units for an image 200 wide."""
     gradient = torch.tensor(gradients)[:, None] * torch.tensor([[1 / 100.0, 0.0]])
-    strategy.prepare(len(gradients), "cpu")
+    strategy.allocate(len(gradients), "cpu")
     strategy.accumulate(rendering_with(gradient, torch.ones(len(gradients), dtype=bool)), 200, 100, torch.tensor(1.0))
 
 
 def test_statistics_are_means_over_the_photos_that_show_it():
     strategy = adc_strategy()
     gradient = torch.tensor([[3.0, 0.0], [0.0, 4.0]])
-    strategy.prepare(2, "cpu")
+    strategy.allocate(2, "cpu")
     strategy.accumulate(rendering_with(gradient, torch.tensor([True, True])), 200, 100, torch.tensor(1.0))
     strategy.accumulate(
         rendering_with(gradient * float("nan"), torch.tensor([True, True])), 200, 100, torch.tensor(0.0)
@@ -105,9 +105,9 @@ def test_statistics_stay_where_recorded_steps_add_to_them():
     held = strategy.gradient_sum, strategy.photo_count
     for iteration in (600, 14_900):  # The last change too: steps after it still add.
         strategy.refine(iteration, gaussians, adam(gaussians), torch.Generator().manual_seed(0))
-        strategy.prepare(4, "cpu")
+        strategy.allocate(4, "cpu")
         assert strategy.gradient_sum is held[0] and strategy.photo_count is held[1] and not torch.cat(held).any()
-    strategy.prepare(6, "cpu")
+    strategy.allocate(6, "cpu")
     assert strategy.photo_count.shape == (6,) and strategy.state_dict(5)["seen"].shape == (5,)
 
 

@@ -35,7 +35,7 @@ class AdcStrategy(Strategy):
         """Return True until refinement stops."""
         return iteration < self.schedule.stop
 
-    def prepare(self, rows: int, device: torch.device | str) -> None:
+    def allocate(self, rows: int, device: torch.device | str) -> None:
         """Allocate statistics; those of rows that exist already are copied."""
         if self.gradient_sum is None or len(self.gradient_sum) != rows:
             self.gradient_sum = _resize(self.gradient_sum, rows, device)

@@ -72,7 +72,7 @@ class Strategy:
         """Return whether accumulate() needs the gradients of the projected means at this iteration."""
         return False
 
-    def prepare(self, rows: int, device: torch.device | str) -> None:
+    def allocate(self, rows: int, device: torch.device | str) -> None:
         """Allocate statistics for `rows` rows, of which the Gaussians are the first."""
 
     def accumulate(self, rendering: Rendering, width: int, height: int, usable: Tensor) -> None:
