@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch._subclasses import FakeTensor
 
 DEVICES = "cpu", "cuda"
 SINGULAR = 1e-9  # Least determinant of a camera's rotation, relative to the cube of its largest number
@@ -113,7 +114,8 @@ def check_render_options(near_plane: Any, alpha_threshold: Any) -> None:
 def check_memory(**tensors: Tensor) -> None:
     """Raise TypeError for tensors without memory, as FakeTensor and DTensor."""
     for name, tensor in tensors.items():
-        if tensor.numel() and not tensor.data_ptr():
+        # Torch warns where the address of a FakeTensor is read.
+        if isinstance(tensor, FakeTensor) or (tensor.numel() and not tensor.data_ptr()):
             raise TypeError(f"{name} is a {type(tensor).__name__}, which has no memory; pass a plain tensor")
 
 

@@ -8,7 +8,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import graph
 
 from sehdr_warp.compat.gsplat import rasterization
-from sehdr_warp.rasterizer import rasterize, ssim
+from sehdr_warp.rasterizer import rasterize, spherical_harmonics, ssim
 from tests.compat.gsplat.scenes import scene
 from tests.rasterizer.test_torch_contract import HEIGHT, WIDTH, splats
 
@@ -25,7 +25,7 @@ def calls():
     return [(draw, splats(dtype=torch.float32)), (draw_as_gsplat, scene(count=40)[0])]
 
 
-@pytest.mark.filterwarnings("ignore:Accessing the data pointer:UserWarning")
+@pytest.mark.filterwarnings("error")
 def test_tensors_without_memory_are_refused_and_leave_nothing_behind():
     """A kernel that reads address 0 ends the process."""
     leaves, place = scene(count=4173)  # A number of rows that no other test has, so its ranges are made here.
@@ -37,6 +37,8 @@ def test_tensors_without_memory_are_refused_and_leave_nothing_behind():
             rasterization(*map(mode.from_tensor, leaves), poses, lenses, *place[2:])
         with pytest.raises(TypeError, match="opacities is a FakeTensor, which has no memory"):
             draw(*map(mode.from_tensor, splats(dtype=torch.float32)))
+        with pytest.raises(TypeError, match="coefficients is a FakeTensor, which has no memory"):
+            spherical_harmonics(1, torch.ones(5, 4, 3), torch.ones(5, 3), torch.zeros(3))
     assert rasterization(*leaves, *place)[0].isfinite().all()
 
 

@@ -15,7 +15,7 @@ from ...kernels.harmonics import (
     harmonics_kernel,
     jacobian_backward_kernel,
 )
-from ..checks import check_tensors, integer
+from ..checks import check_memory, check_tensors, integer
 from ..torch_contract import once_differentiable, torch_operation
 from ..warp_launch.launching import launch, warp_scalar
 
@@ -43,6 +43,7 @@ def spherical_harmonics(
         ValueError: for a degree out of range, and for shapes, dtypes or devices that do not fit.
     """
     degree, constant, rest = check_harmonics(degree, coefficients, means, camera_position)
+    check_memory(coefficients=constant, means=means)
     return _Evaluation.apply(degree, *(t.contiguous() for t in (constant, rest, means, camera_position)))
 
 
