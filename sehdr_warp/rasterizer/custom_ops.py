@@ -84,6 +84,8 @@ def register_custom_op(name: str, options: str, run: Operation, fake: Operation)
 
 def _as_float(*tensors: Tensor) -> list[Tensor]:
     """Return the tensors as autocast leaves them; see torch_operation()."""
+    if not all(isinstance(tensor, Tensor) for tensor in tensors):
+        raise TypeError("an argument is not a torch tensor")  # The compiler then calls what names it.
     halves = [tensor.dtype in HALF and torch.is_autocast_enabled(tensor.device.type) for tensor in tensors]
     return [tensor.float() if half else tensor for tensor, half in zip(tensors, halves, strict=True)]
 

@@ -66,16 +66,17 @@ def torch_operation(function: Callable[P, T], *, compiles: bool = False) -> Call
             return _without_autocast(function, args, kwargs)
         return function(*args, **kwargs)
 
-    operation: Any = call
-    if compiles:
-        return operation
-    # What torch.compiler.disable() does, without its import of Dynamo, which takes two seconds. Dynamo marks code,
-    # which this operation must not share with those that compile.
-    operation.__code__ = operation.__code__.replace()
-    operation._torchdynamo_disable = True
-    operation._torchdynamo_disable_msg = "it launches Warp kernels"
-    set_code_exec_strategy(operation.__code__, _FrameExecStrategy(_FrameAction.SKIP, _FrameAction.SKIP))
-    return operation
+    if not compiles:
+        _hide_from_dynamo(call)
+    return call
+
+
+def _hide_from_dynamo(function: Any) -> None:
+    """Do what torch.compiler.disable() does, without its import of Dynamo, which takes two seconds."""
+    function.__code__ = function.__code__.replace()  # Dynamo marks code, which functions share.
+    function._torchdynamo_disable = True
+    function._torchdynamo_disable_msg = "it launches Warp kernels"
+    set_code_exec_strategy(function.__code__, _FrameExecStrategy(_FrameAction.SKIP, _FrameAction.SKIP))
 
 
 def _has_tangent(value: Any) -> bool:
@@ -125,6 +126,7 @@ def once_differentiable(backward: Callable[..., T]) -> Callable[..., T]:
         tensors = [*parts, *sources]
         return _Once.apply(len(parts), *tensors)
 
+    _hide_from_dynamo(call)  # From compiled autograd, which would trace it
     return call
 
 

@@ -106,6 +106,37 @@ def test_a_misfit_is_named_while_compiling():
         draw(leaves[0][:, :2])
 
 
+def test_what_is_no_tensor_is_named_by_the_operation():
+    arguments = *splats(dtype=torch.float32), WIDTH, HEIGHT
+    draw = torch.compile(lambda color: rasterize(*arguments, background=color).image, backend="eager")
+    with pytest.raises(TypeError, match="background is a list, expected a torch tensor"):
+        draw([1.0, 1.0])
+
+
+COMPILED_AUTOGRAD = """
+import torch
+from sehdr_warp.compat.gsplat import rasterization
+from tests.compat.gsplat.scenes import scene
+from tests.rasterizer.test_torch_contract import NAMES, operations
+
+torch._dynamo.config.compiled_autograd = True
+cases = [operations()[name] for name in NAMES if name != "transmittance"]
+leaves, place = scene(count=40)
+cases.append((lambda *leaves: rasterization(*leaves, **place._asdict())[0], leaves))
+for function, leaves in cases:
+    torch._dynamo.reset()
+    truth = torch.autograd.grad(function(*leaves).sum(), leaves)
+    loss = function(*leaves).sum()
+    torch.compile(lambda: loss.backward(), backend="eager")()
+    assert all(torch.equal(leaf.grad, true) for leaf, true in zip(leaves, truth)), "other gradients"
+"""
+
+
+def test_compiled_autograd_calls_backward_passes_as_they_are():
+    done = subprocess.run([sys.executable, "-c", COMPILED_AUTOGRAD], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and not done.stderr.strip(), done.stderr
+
+
 def test_half_precision_is_cast_under_autocast():
     leaves = splats(dtype=torch.float32)
     half = leaves[4].detach().bfloat16()
