@@ -19,6 +19,7 @@ from torch import Tensor
 from ..limits import format_bytes
 from ..model.radiance_field import RadianceField
 from ..model.renders import CameraTensors
+from ..rasterizer.warp_launch.threads import one_torch_thread
 from ..runs.config import Config
 from ..runs.light_estimates import ClippedLight, light_estimates
 from ..scene import View
@@ -48,7 +49,8 @@ class DataManager:
         """Estimates of each view's clipped light; None if there are none, or if colors are encoded values."""
         field = self._field
         response = None if field.color_model.display_referred else field.response
-        return light_estimates(self._scene_views, response, self._config.loss, field.gaussians.means.device)
+        with one_torch_thread():  # As in the steps, because the prior's sums depend on the number of threads.
+            return light_estimates(self._scene_views, response, self._config.loss, field.gaussians.means.device)
 
     @property
     def clipped_light_targets(self) -> list[Tensor] | None:

@@ -197,3 +197,14 @@ def test_streamed_steps_are_recorded_and_the_same_on_a_gpu(scene, change):
         states.append(state_of(trainer).tensors)
     for name, value in states[0].items():
         assert torch.equal(value, states[1][name]), name
+
+
+def test_clipped_light_is_estimated_on_one_thread(monkeypatch):
+    """Its sums depend on the number of threads, and a resumed training, whose steps use one, estimates it again."""
+    manager, before = make_trainer(toy_scene(), VARIANTS["default"]).data_manager, torch.get_num_threads()
+    monkeypatch.setattr("sehdr_warp.training.data_manager.light_estimates", lambda *_: torch.get_num_threads())
+    torch.set_num_threads(3)
+    try:
+        assert manager.light_estimates == 1 and torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
