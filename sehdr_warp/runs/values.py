@@ -114,6 +114,7 @@ class CheckpointValues(Values):
     run: Annotated[dict[str, str], Field(default_factory=dict)]
     large_scene: bool | None = None
     nearest_points: list[float] | None = None
+    median_depth: Annotated[FiniteFloat, Field(gt=0)] | None = None
 
 
 class RegionValues(Values):

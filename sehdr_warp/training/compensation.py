@@ -129,9 +129,12 @@ def estimates_compensation(scene: Scene, config: Config, response: Response) -> 
 
 
 def estimate_compensation(
-    scene: Scene, config: Config, response: Response, device: torch.device | str
+    scene: Scene, config: Config, response: Response, device: torch.device | str, depth: float | None = None
 ) -> CompensationEstimate:
-    """Match points between the photos of a scene and estimate the compensation that explains their differences."""
+    """Match points between the photos of a scene and estimate the compensation that explains their differences.
+
+    `depth` is that of make_matcher().
+    """
     times_known = scene.exposure_times_known and config.model.exposure_compensation != "always"
     views, others = scene.train_views, scene.test_views
 
@@ -145,12 +148,12 @@ def estimate_compensation(
 
     # Resized once, because the photos are read and corrected several times.
     small = replace(scene, views=at_matching_size(views))
-    matcher = make_matcher(small, response, device)
+    matcher = make_matcher(small, response, device, depth)
     if times_known and not _may_drift(rough := match(matcher, ROUGH_POINTS)):
         return no_drift(matcher, rough)
     matched, guess = match(matcher), initial_gains(small.views, response)
     if not times_known and len(matched) < ENOUGH_MATCHES * POINTS and guess.stops > MIN_STOPS:
-        alike = match(make_matcher(guess.normalize_photos(small, response), response, device))
+        alike = match(make_matcher(guess.normalize_photos(small, response), response, device, depth))
         matched = max(matched, alike, key=len)
     if len(matched) < MIN_POINTS:
         return no_drift(matcher, matched)
@@ -160,7 +163,7 @@ def estimate_compensation(
         return no_drift(matcher, matched, None if times_known else compensation)
     # Match again in photos that are already similar: more points are found.
     parts = compensation.parts(**components._asdict())
-    matcher = make_matcher(parts.normalize_photos(small, response), response, device)
+    matcher = make_matcher(parts.normalize_photos(small, response), response, device, depth)
     matched = match(matcher)
     compensation = matched.fit().parts(**components._asdict())
     return CompensationEstimate(compensation, _decision(compensation, components, matched, times_known), None)

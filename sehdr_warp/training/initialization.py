@@ -213,15 +213,19 @@ def start_count(config: Config, pixels: int) -> int:
     return min(most, round(config.model.initial_density * math.sqrt(pixels)))
 
 
-def make_matcher(scene: Scene, response: Response, device: torch.device | str) -> Matcher:
-    """Create a matcher of the training views, with depths around those of the points or of the cameras' focus."""
+def make_matcher(scene: Scene, response: Response, device: torch.device | str, depth: float | None = None) -> Matcher:
+    """Create a matcher of the training views, with depths around `depth`, by default depth_of_points()."""
     views = at_matching_size(perspective_views(scene.train_views))
-    points = every_nth(scene.points, MOST_DEPTHS)
+    return Matcher(views, response, depth_of_points(scene) if depth is None else depth, device)
+
+
+def depth_of_points(scene: Scene) -> float:
+    """Return the median depth of the points in the training views, of fewer than FEWEST_POINTS focus_distance()."""
+    views, points = perspective_views(scene.train_views), every_nth(scene.points, MOST_DEPTHS)
     homogeneous = np.c_[points, np.ones(len(points))]
     depths = [homogeneous[view.camera.project(points).inside] @ view.camera.world_to_camera[2] for view in views]
     depths = np.concatenate(depths)
-    focus = float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(views)
-    return Matcher(views, response, focus, device)
+    return float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(views)
 
 
 def check_views(scene: Scene) -> None:

@@ -25,14 +25,14 @@ from ..scene import Scene
 from ..scene.normalization import Normalization, normalization_of
 from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from .hdr_truth import check_scene_truth
-from .initialization import make_field, make_matcher, response_for_training
+from .initialization import depth_of_points, make_field, make_matcher, response_for_training
 from .plan import check_fields, make_plan
 from .process_settings import summary_writer
 from .ranks import Ranks
 from .run_output import RunOutput
 from .seeding import brighten_clipped
 from .trainer import Trainer, sizes_of
-from .training_state import load_state, state_of
+from .training_state import load_state, scene_facts_of, state_of
 from .workers import send_training, several_ranks_notes
 
 log = logging.getLogger(__name__)
@@ -151,17 +151,18 @@ def _new_trainer(
     check_scene_truth(scene, config.loss)  # Here, before the photos are matched; GradientStep repeats it.
     response = response_for_training(scene, config)
     started = time.perf_counter()
+    depth = depth_of_points(normalized)
     compensation, matcher = None if shared is None else shared.compensation_of(scene.views), None
     if shared is None and plan is not None and estimates_compensation(scene, config, response):
-        estimate = estimate_compensation(normalized, config, response, device)
+        estimate = estimate_compensation(normalized, config, response, device, depth)
         compensation, matcher = estimate.compensation, estimate.matcher
         plan = replace(plan, decisions=(*plan.decisions, estimate.decision))
     photos = scene if compensation is None else compensation.normalize_photos(scene, response)
     normalized = normalization.scene(photos)
     # One matcher for compensation, initial points and seeds; made when it is needed, because it takes long.
-    get_matcher = cache(lambda: matcher or make_matcher(normalized, response, device))
+    get_matcher = cache(lambda: matcher or make_matcher(normalized, response, device, depth))
     field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
-    trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks)
+    trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks, median_depth=depth)
     light = trainer.data_manager.clipped_light_targets  # Estimated once, for this and for the loss.
     if light is not None and not config.model.init_file:
         brighten_clipped(field, normalized.train_views, light)
@@ -194,7 +195,7 @@ def _resumed_trainer(
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
     longer = config.continued_after(finished_at)
-    facts = {name: checkpoint.values.get(name) for name in ("large_scene", "nearest_points")}
+    facts = scene_facts_of(checkpoint)
     if (distances := facts["nearest_points"]) is not None and len(distances) != len(scene.train_views):
         problem = f"nearest_points has {len(distances)} values, and {len(scene.train_views)} photos are trained on"
         raise InputError(checkpoint.path, problem, "remove it, or train again")

@@ -34,7 +34,7 @@ from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
 from .data_manager import DataManager, PhotoSampler
 from .gradient_step import OVERFLOWED, SKIPPED, GradientStep, StepOptions, StepResult
-from .initialization import make_matcher
+from .initialization import depth_of_points, make_matcher
 from .matching import Matcher
 from .moving_average import MovingAverage
 from .optimizer import make_optimizer, means_rate, set_means_rate
@@ -80,6 +80,7 @@ class Trainer:
         total: Iterations in all.
         large_scene: Whether photos show little of the scene, see scene_facts.is_large().
         nearest_points: Distances of the nearest points from the cameras, see strategies.floaters; 0 in a large scene.
+        median_depth: Depth around which photos are matched, see depth_of_points().
         batch: Photos of a step, one for each rank; each counts as an iteration.
         step_batch: Photos of the last step: `batch`, or fewer if fewer iterations were left.
         seconds: Duration so far, without evaluation, renders for figures that are shown, and checkpoints.
@@ -95,12 +96,13 @@ class Trainer:
         ranks: Ranks | None = None,
         large_scene: bool | None = None,
         nearest_points: list[float] | None = None,
+        median_depth: float | None = None,
     ):
         """Prepare a training on the device of the field; create_trainer() does this for a scene and a run folder.
 
         `config` is that after the plan. get_matcher() returns the matcher of the training photos that seeding uses,
-        by default a new one. `ranks` train together. large_scene and nearest_points are those of a training that goes
-        on, whose scene may lack points; by default those of the scene.
+        by default a new one. `ranks` train together. large_scene, nearest_points and median_depth are those of a
+        training that goes on, whose scene may lack points; by default those of the scene.
         """
         self.scene, self.config, self.field, self.ranks = scene, config, field, ranks
         self.output: RunOutput | None = None
@@ -126,7 +128,8 @@ class Trainer:
             problem = f"view {wide.name} is {wide.camera.projection}, for which densification.strategy = 'adc' has no "
             raise InputError(scene.name, f"{problem}projected centers", "use densification.strategy=mcmc")
         self._can_seed = wide is None
-        own_matcher = cache(partial(make_matcher, normalized, field.response, self.device))
+        self.median_depth = depth_of_points(normalized) if median_depth is None else median_depth
+        own_matcher = cache(partial(make_matcher, normalized, field.response, self.device, self.median_depth))
         self._get_matcher: Callable[[], Matcher] | None = get_matcher or own_matcher  # None after the last refinement
 
         field.gaussians.release()  # Another trainer of this field may have reserved rows for its own optimizer.

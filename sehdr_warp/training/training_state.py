@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -12,6 +12,8 @@ from .optimizer import load_optimizer_tensors, optimizer_tensors
 
 if TYPE_CHECKING:
     from .trainer import Trainer
+
+_SCENE_FACTS = "large_scene", "nearest_points", "median_depth"  # Of points that a training that goes on may lack
 
 
 def state_of(trainer: Trainer) -> Checkpoint:
@@ -30,8 +32,13 @@ def state_of(trainer: Trainer) -> Checkpoint:
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
     values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining}
     values |= {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
-    values |= {"large_scene": trainer.large_scene, "nearest_points": trainer.nearest_points}
+    values |= {name: getattr(trainer, name) for name in _SCENE_FACTS}
     return Checkpoint(tensors, values)
+
+
+def scene_facts_of(state: Checkpoint) -> dict[str, Any]:
+    """Return arguments of Trainer() for a training that continues from a state; of an earlier version some are None."""
+    return {name: state.values.get(name) for name in _SCENE_FACTS}
 
 
 def load_state(trainer: Trainer, state: Checkpoint) -> None:

@@ -25,6 +25,7 @@ from sehdr_warp.training.training_state import load_state, state_of
 
 from ..refusals import call
 from .toy import VARIANTS, make_trainer, quick, toy_scene, without_truth
+from .wall_and_lamp import wall_and_lamp
 
 
 @pytest.mark.parametrize("variant", ["adc", "default", "paper"])
@@ -73,6 +74,19 @@ def test_the_nearest_points_are_those_of_the_start(scene, tmp_path):
     file.write_text(json.dumps(json.loads(file.read_text()) | {"nearest_points": before[1:]}))
     with pytest.raises(InputError, match=f"has {len(before) - 1} values, and {len(before)} photos"):
         create_trainer(bare, tmp_path, device="cpu", resume=True)
+
+
+def test_a_training_that_goes_on_without_its_points_is_exact(tmp_path):
+    """Its seeds take the depths of the start."""
+    bare, config = wall_and_lamp(), quick(**{"densification.cap_max": 900})
+    points = np.random.default_rng(0).uniform([-1, -1, 0.5], [1, 1, 0.7], (500, 3))
+    scene = replace(bare, points=points, point_colors=np.full((500, 3), 0.5, np.float32))
+    for step in create_trainer(scene, tmp_path / "whole", config, device="cpu"):
+        if step.iteration == 66:
+            shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    train(bare, tmp_path / "cut", device="cpu", resume=True)
+    whole, cut = (RunFolder(tmp_path / name).newest_checkpoint() for name in ("whole", "cut"))
+    assert all(torch.equal(value, cut.tensors[name]) for name, value in whole.tensors.items())
 
 
 def test_a_run_begins_with_a_checkpoint_of_its_start(scene, trained, tmp_path):
