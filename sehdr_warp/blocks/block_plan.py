@@ -30,7 +30,7 @@ from ..scene.normalization import Normalization, normalization_of
 from ..subsets import every_nth
 from ..training.compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from ..training.cost import OVERLAP
-from ..training.initialization import base_time, check_views, match_points, response_for_training
+from ..training.initialization import base_time_of, check_views, match_points, response_for_training
 from ..training.matching import LARGEST_SIDE
 from ..training.plan import STEPS_PER_PHOTO
 from .division import Cell, Division, divide, largest_count, thin_out, weights_of
@@ -224,7 +224,7 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
         compensation = result.compensation
         log.info("plan: %s: %s (%s)", result.decision.name, result.decision.choice, result.decision.reason)
     compensated = scene if compensation is None else compensation.normalize_photos(scene, response)
-    shared = SharedDecisions(base_time(compensated), compensation)
+    shared = SharedDecisions(base_time_of(compensated), compensation)
     views = scene.train_views
     cameras = [view.camera for view in views]
     points = _places(compensated, response, device)

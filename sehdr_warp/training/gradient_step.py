@@ -202,10 +202,10 @@ class GradientStep:
         )
         loss = data_loss(field, render, target, self._loss, self._largest_truth)
         if options.opacity_weight:
-            # Of wide cameras, which have no extents, all Gaussians count.
-            spares_unseen = self._spares_unseen and camera.directions is None
-            moments = moments_of(self.optimizer, field.gaussians.opacity_logits) if spares_unseen else {}
-            loss = loss + opacity_loss(field, render, options.opacity_weight, moments.get("exp_avg_sq"))
+            moments = None
+            if self._spares_unseen and camera.directions is None:  # Renders of wide cameras have no extents.
+                moments = moments_of(self.optimizer, field.gaussians.opacity_logits).get("exp_avg_sq")
+            loss = loss + opacity_loss(field, render, options.opacity_weight, moments)
         if options.size_weight and not self._spares_unseen:
             loss = loss + size_loss(field.gaussians, options.size_weight)
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in it.

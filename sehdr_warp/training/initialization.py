@@ -45,7 +45,7 @@ MAX_START_ANGLE = 0.2
 that are far from all others, such as those of a background, would else start as veils before cameras of new views."""
 
 
-def base_time(scene: Scene) -> float:
+def base_time_of(scene: Scene) -> float:
     """Return dt_1, the median exposure time of the training photos, seconds; of two in the middle the shorter.
 
     So it is the exposure of a photo, whose white and middle grey pictures at 0 EV have.
@@ -80,22 +80,22 @@ def make_field(
     response: Response,
     device: torch.device | str,
     get_matcher: Callable[[], Matcher] | None = None,
-    time: float | None = None,
+    base_time: float | None = None,
 ) -> RadianceField:
     """Return the field at iteration 0: the Gaussians of model.init_file, or one at each of start_points().
 
-    The scene is in its own coordinates, field and matcher in normalized ones. `time` is dt_1, the exposure time that
-    colors refer to, seconds, by default base_time(). Raises InputError for a scene that cannot be trained.
+    The scene is in its own coordinates, field and matcher in normalized ones. `base_time` is dt_1, the exposure
+    time that colors refer to, seconds, by default base_time_of(). Raises InputError for a scene that cannot be trained.
     """
     check_views(scene)
-    time = time or base_time(scene)
+    base_time = base_time or base_time_of(scene)
     normalization = normalization_of(scene)
     normalized = normalization.scene(scene)
     normalized = replace(normalized, views=perspective_views(normalized.train_views))
     rng = np.random.default_rng(config.seed)
     if config.model.init_file:
-        gaussians = start_gaussians(normalized, config, response, rng, normalization, time)
-        return assemble_field(gaussians, config, response, time, normalization).to(device)
+        gaussians = start_gaussians(normalized, config, response, rng, normalization, base_time)
+        return assemble_field(gaussians, config, response, base_time, normalization).to(device)
     get_matcher = get_matcher or partial(make_matcher, normalized, response, device)
     points, colors = start_points(normalized, config, get_matcher, rng)
     most = config.densification.cap_max
@@ -107,7 +107,7 @@ def make_field(
     gaussians = Gaussians.from_points(points, dc, config.model.sh_degree)
     if config.densification.strategy == "mcmc":  # Others start as 3DGS does.
         _limit_sizes(gaussians, normalized.views)
-    return assemble_field(gaussians, config, response, time, normalization).to(device)
+    return assemble_field(gaussians, config, response, base_time, normalization).to(device)
 
 
 @torch.no_grad()
@@ -127,7 +127,7 @@ def start_gaussians(
     response: Response,
     rng: np.random.Generator,
     normalization: Normalization,
-    time: float,
+    base_time: float,
 ) -> Gaussians:
     """Return the Gaussians of the file that model.init_file names, in the config's color model and degree.
 
@@ -138,14 +138,14 @@ def start_gaussians(
     if read.count > config.densification.cap_max:
         read = read.rows(np.sort(rng.choice(read.count, config.densification.cap_max, replace=False)))
     degree = config.model.sh_degree
-    read = replace(read.padded(degree), base_time=time if read.color_model == "display" else read.base_time)
+    read = replace(read.padded(degree), base_time=base_time if read.color_model == "display" else read.base_time)
     read = replace(read, harmonics=read.harmonics[:, : (degree + 1) ** 2])
     field = field_of(read)
     field.response = response
     positions = np.stack([view.camera.position for view in scene.train_views])
-    gaussians = gaussians_of(field, config.model.radiance, positions, time)
+    gaussians = gaussians_of(field, config.model.radiance, positions, base_time)
     _log.info("starting from the %d Gaussians of %s", read.count, config.model.init_file)
-    return field_of(replace(gaussians, base_time=time)).gaussians.requires_grad_()
+    return field_of(replace(gaussians, base_time=base_time)).gaussians.requires_grad_()
 
 
 def start_points(

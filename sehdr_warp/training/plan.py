@@ -21,7 +21,7 @@ from ..scene import Scene
 from ..scene.photos import FEWEST_PHOTOS
 from .cost import cpu_seconds
 from .hdr_truth import largest_hdr_truth
-from .initialization import base_time, start_count
+from .initialization import base_time_of, start_count
 from .scene_facts import LARGE_SCENE, SceneFacts, measure_scene
 from .strategies import mcmc_cap
 
@@ -186,7 +186,7 @@ def check_fields(scene: Scene, config: Config) -> None:
         raise InputError(scene.name, f"{path} = {json.dumps(attrgetter(path)(config))}, but {problem}", remedy)
 
     if "fusion.exposures" in user_fields:
-        base = base_time(scene)
+        base = base_time_of(scene)
         timed = [item for item in config.fusion.exposures if is_seconds(item)]
         if timed and not scene.exposure_times_known:
             problem = f"{timed[0]} is a time and the photos state none"

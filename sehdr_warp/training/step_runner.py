@@ -54,7 +54,7 @@ class StepRunner:
     ) -> StepResult:
         """Do GradientStep.run() on view `index`; if photos are streamed, fetch view `next_index` at the same time."""
         step, gaussians = self._step, self._step.field.gaussians
-        # Not if Gaussians.surround() has, for those that are rendered but not trained.
+        # Gaussians.surround() adds rows of its own, which are rendered but not trained: none are reserved then.
         if self.reserves_rows and not self._reserved_rows and gaussians.row_count == gaussians.count:
             self._reserve_rows(iteration)
         step.prepare(options, iteration)

@@ -137,35 +137,35 @@ def _new_trainer(
     *,
     overwrite: bool,
 ) -> Trainer:
-    """Plan, choose the response, prepare the photos, initialize the field, and begin the run folder.
+    """Plan, choose the response, compensate the photos, initialize the field, and begin the run folder.
 
-    `scene` and `photos` are in the photos' own coordinates, `normalized` in those of the Gaussians.
+    `scene` and, after the compensation, `photos` are in their own coordinates; normalized ones in the Gaussians'.
     """
     normalization = normalization_of(scene)
-    normalized = normalization.scene(scene)
-    plan = make_plan(normalized, config, device) if config.plan.enabled else None
+    normalized_scene = normalization.scene(scene)
+    plan = make_plan(normalized_scene, config, device) if config.plan.enabled else None
     if plan is None:
-        check_fields(normalized, config)  # As make_plan() does.
+        check_fields(normalized_scene, config)  # As make_plan() does.
     else:
         config = plan.config
     check_scene_truth(scene, config.loss)  # Here, before the photos are matched; GradientStep repeats it.
     response = response_for_training(scene, config)
     started = time.perf_counter()
-    depth = depth_of_points(normalized)
+    depth = depth_of_points(normalized_scene)
     compensation, matcher = None if shared is None else shared.compensation_of(scene.views), None
     if shared is None and plan is not None and estimates_compensation(scene, config, response):
-        estimate = estimate_compensation(normalized, config, response, device, depth)
+        estimate = estimate_compensation(normalized_scene, config, response, device, depth)
         compensation, matcher = estimate.compensation, estimate.matcher
         plan = replace(plan, decisions=(*plan.decisions, estimate.decision))
     photos = scene if compensation is None else compensation.normalize_photos(scene, response)
-    normalized = normalization.scene(photos)
+    normalized_photos = normalization.scene(photos)
     # One matcher for compensation, initial points and seeds; made when it is needed, because it takes long.
-    get_matcher = cache(lambda: matcher or make_matcher(normalized, response, device, depth))
+    get_matcher = cache(lambda: matcher or make_matcher(normalized_photos, response, device, depth))
     field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
     trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks, median_depth=depth)
     light = trainer.data_manager.clipped_light_targets  # Estimated once, for this and for the loss.
     if light is not None and not config.model.init_file:
-        brighten_clipped(field, normalized.train_views, light)
+        brighten_clipped(field, normalized_photos.train_views, light)
     trainer.seconds = time.perf_counter() - started
     # The folder is begun last, when the scene is known to be usable.
     plan_values, state = None if plan is None else plan.to_dict(), state_of(trainer)

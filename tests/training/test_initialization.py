@@ -24,7 +24,7 @@ from sehdr_warp.splats import write_gaussians
 from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.initialization import (
     MAX_START_ANGLE,
-    base_time,
+    base_time_of,
     colors_in_views,
     focus_distance,
     make_field,
@@ -75,7 +75,7 @@ def test_a_training_starts_from_a_file_of_gaussians(scene, tmp_path, radiance, d
     camera = scene.views[0].camera
     expected = field_of(written).render(camera).hdr
     if radiance == "display":  # Colors of the scene's own photos.
-        expected = expected * written.base_time / base_time(scene)
+        expected = expected * written.base_time / base_time_of(scene)
     rendered = field.render(camera).hdr
     assert float(expected.max()) > 0.01
     assert float((rendered - expected).abs().mean()) < 0.02 * float(expected.mean())
@@ -142,7 +142,7 @@ def test_start_colors_invert_the_colour_model(radiance):
 def test_base_time_is_that_of_a_photo_in_the_middle(scene):
     times = [0.1, 0.2, 0.4, 8.0]
     views = tuple(dataclasses.replace(v, exposure_time=t) for v, t in zip(scene.train_views, times, strict=False))
-    assert base_time(dataclasses.replace(scene, views=views)) == 0.2
+    assert base_time_of(dataclasses.replace(scene, views=views)) == 0.2
 
 
 @pytest.mark.parametrize("method", ["posterior", "paper"])
