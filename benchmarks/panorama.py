@@ -74,7 +74,7 @@ def main(
     scene = _scene(cameras, photos)
     settings = {"views": views, "size": size, "width": width, "samples": samples, "iterations": iterations}
     result = new_result("panorama", torch.device(device), settings)
-    config = load_config("truth", {"schedule.iterations": iterations, "mcmc.prune_near_angle": 0.12})
+    config = load_config("truth", {"schedule.iterations": iterations})
     is_trained = (work / "run" / "summary.json").is_file()
     run = load_run(work / "run", device=device) if is_trained else train(scene, work / "run", config, device=device)
     at = (float(PLACE[0]), float(PLACE[1]), float(PLACE[2]))

@@ -1,4 +1,4 @@
-"""Configs as presets, files and nested values, and the names of fields in version 0.2."""
+"""Configs as presets, files and nested values, and the names of fields in earlier versions."""
 
 import json
 import logging
@@ -27,7 +27,7 @@ _REMEDY = "`sehdr-warp config` lists every field with its meaning"
 _GONE = tomllib.loads((resources.files("sehdr_warp.runs") / "gone.toml").read_text(encoding="utf-8"))
 RENAMED: dict[str, str] = _GONE.pop("renamed")  # Fields of version 0.2, each with its name since version 0.3
 GONE: dict[str, str] = {path: advice for advice, paths in _GONE.items() for path in paths}
-"""Fields of version 0.2 that no longer exist, each with what to do instead."""
+"""Fields of earlier versions that no longer exist, each with what to do instead."""
 _RENAMED_VALUES = {"densification.strategy": {"relocation": "mcmc", "gradient": "adc"}}
 
 
@@ -145,9 +145,13 @@ def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping
     """Validate nested values, as Config.model_dump() returns them and JSON stores them.
 
     Raises:
-        InputError: With the flag of the wrong field, or else `source`. For a field of version 0.2 it names the new
-            field, or what to do instead.
+        InputError: With the flag of the wrong field, or else `source`. For a field of an earlier version it names the
+            new field, or what to do instead; one that is gone may be 0, which was off.
     """
+    for path in GONE:
+        part, _, name = path.rpartition(".")
+        if isinstance(table := values.get(part), dict) and table.get(name) == 0:
+            values = values | {part: {key: value for key, value in table.items() if key != name}}
     try:
         return Config.model_validate(values)
     except ValidationError as error:
@@ -158,7 +162,7 @@ def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping
     if flag is None and flags and not path:  # Contradicting fields: name the flag of the first.
         flag = next((flag for path, flag in flags.items() if path in problem), None)
     if path in GONE:
-        raise InputError(source, f"{problem} of version 0.2 is gone", GONE[path])
+        raise InputError(source, f"{problem} is of an earlier version and gone", GONE[path])
     if path in RENAMED:
         raise InputError(source, f"{problem} has another name since version 0.3", f"write {RENAMED[path]}")
     raise InputError(flag or source, problem, _REMEDY)

@@ -154,11 +154,15 @@ def test_an_override_is_blamed_by_its_flag_and_never_the_file():
         load_config("paper", {"fusion.enabled.x": 1})
 
 
-def test_a_gone_field_of_version_0_2_is_named(tmp_path):
+def test_a_gone_field_is_named_unless_it_was_off(tmp_path):
+    """Runs and files of earlier versions hold all fields."""
     values = Config().model_dump()
-    values["loss"]["clipped_lift"] = 0.5
-    with pytest.raises(InputError, match="config.json: loss.clipped_lift = 0.5 of version 0.2 is gone"):
+    values["mcmc"]["prune_near_angle"], values["loss"]["clipped_lift"] = 0.0, 0.5
+    problem = "config.json: loss.clipped_lift = 0.5 is of an earlier version and gone; it gained nothing"
+    with pytest.raises(InputError, match=problem):
         config_from_dict(values, tmp_path / "config.json")
+    values["loss"]["clipped_lift"] = 0.0
+    assert config_from_dict(values) == Config() and values["mcmc"]["prune_near_angle"] == 0.0
 
 
 @pytest.mark.parametrize(

@@ -42,8 +42,6 @@ class TrainingCameras(NamedTuple):
 
     def used_by(self, options: McmcConfig) -> "TrainingCameras | None":
         """Return the cameras by which floater_mask() finds floaters, None if there are none."""
-        if options.prune_near_angle:
-            return self
         used = options.prune_near_points * self.nearest_points > 0
         return TrainingCameras(*(each[used] for each in self)) if used.any() else None
 
@@ -63,27 +61,20 @@ def distances_of_points(views: Sequence[View], points: np.ndarray) -> list[float
 
 
 def floater_mask(gaussians: Gaussians, cameras: TrainingCameras, options: McmcConfig) -> Tensor:
-    """Return a mask [N] of floaters.
+    """Return a mask [N] of floaters: in the view of a camera, nearer than prune_near_points times the nearest points.
 
-    These are Gaussians wider than prune_near_angle times their distance to the nearest camera, and those in the view of
-    a camera that are nearer to it than prune_near_points times the nearest points. Compare the occlusion loss of
-    FreeNeRF (CVPR 2023), which takes density next to the cameras away.
+    Compare the occlusion loss of FreeNeRF (CVPR 2023), which takes density next to the cameras away.
     """
-    nearest, near = [], []
+    near = []
     least = options.prune_near_points * cameras.nearest_points
     for means in gaussians.means.detach().split(max(1, DISTANCES_AT_ONCE // len(cameras.positions))):
         # Not torch.cdist(), which on a GPU takes 256 threads for each distance.
         squares = sum((means[:, axis, None] - cameras.positions[:, axis]).square_() for axis in range(3))
         assert isinstance(squares, Tensor)
-        if options.prune_near_angle:
-            nearest.append(squares.amin(1).sqrt())
         rows, views = (squares < least.square()).nonzero(as_tuple=True)
         in_view = _in_view(means[rows], views, cameras)
         near.append(torch.zeros(len(means), dtype=torch.bool, device=means.device).index_fill_(0, rows[in_view], True))
-    mask = torch.cat(near)
-    if options.prune_near_angle:
-        mask |= gaussians.log_scales.detach().amax(1) > torch.log(options.prune_near_angle * torch.cat(nearest))
-    return mask
+    return torch.cat(near)
 
 
 def _in_view(points: Tensor, views: Tensor, cameras: TrainingCameras) -> Tensor:
