@@ -1,7 +1,7 @@
 """Load a scene: parse a data folder of any layout, choose the response, preprocess the photos."""
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import resources
@@ -109,32 +109,44 @@ def load_scene(
     )
     choice = choose_response(dataset, response, method, candidates)
     dataset, curve = choice.dataset, choice.response
-    names = unique_names(dataset.records)
+    records = dict(zip(unique_names(dataset.records), dataset.records, strict=True))
     if views is not None:
-        indices = [index for index, name in enumerate(names) if name in views]
-        if missing := sorted(set(views) - set(names)):
-            problem = f"{len(missing)} of the views that were named are missing, {missing[0]} first"
+        if absent := sorted(set(views) - records.keys()):
+            problem = f"{len(absent)} of the views that were named are missing, {absent[0]} first"
             raise InputError(path, problem, "put the photos back as they were")
-        names = [names[index] for index in indices]
-        dataset = replace(dataset, records=tuple(dataset.records[index] for index in indices))
-    scene = preprocess(dataset, curve, names, max_size, photo_storage)
-    guessed = {name: record for name, record in zip(names, dataset.records, strict=True) if not record.time_known}
-    if guessed and cameras:  # The training estimated them by points of structure from motion, which are not here.
-        run_times = {camera.world_to_camera.tobytes(): camera.exposure_time for camera in cameras}
-        times = {name: run_times.get(record.world_to_camera.tobytes()) for name, record in guessed.items()}
-        timed = (replace(view, exposure_time=times.get(view.name) or view.exposure_time) for view in scene.views)
-        scene = replace(scene, views=tuple(timed))
-    elif guessed:
+        records = {name: record for name, record in records.items() if name in views}
+        dataset = replace(dataset, records=tuple(records.values()))
+    scene = preprocess(dataset, curve, list(records), max_size, photo_storage)
+    scene = _with_all_times(scene, records, cameras, curve)
+    if dataset.kind != "float":
+        usable = {view.name for view in scene.views}
+        note = exposures_note([record for name, record in records.items() if name in usable])
+        scene = replace(scene, notes=(*scene.notes, *note))
+    return replace(
+        scene,
+        chosen_by=choice.chosen_by,
+        color_matrix=choice.color_matrix,
+        light_known=dataset.kind != "encoded" or curve.name == dataset.stated_response,
+        unplaced=dataset.unplaced,
+    )
+
+
+def _with_all_times(
+    scene: Scene, records: Mapping[str, ImageRecord], cameras: Sequence[PlacedPhoto], response: "Response"
+) -> Scene:
+    """Return a scene with exposure times for photos, by name, that state none: those of a run, or else estimates."""
+    guessed = {name: record for name, record in records.items() if not record.time_known}
+    if not guessed:
+        return scene
+    if not cameras:
         from .exposure.estimate import with_estimated_times
 
-        scene = with_estimated_times(scene, guessed, curve)
-    light_known = dataset.kind != "encoded" or curve.name == dataset.stated_response
-    if dataset.kind != "float":
-        used = {view.name for view in scene.views}
-        records = [record for name, record in zip(names, dataset.records, strict=True) if name in used]
-        scene = replace(scene, notes=(*scene.notes, *exposures_note(records)))
-    facts = {"color_matrix": choice.color_matrix, "light_known": light_known, "unplaced": dataset.unplaced}
-    return replace(scene, chosen_by=choice.chosen_by, **facts)
+        return with_estimated_times(scene, guessed, response)
+    # The training estimated them by points of structure from motion, which are not here.
+    run_times = {camera.world_to_camera.tobytes(): camera.exposure_time for camera in cameras}
+    times = {name: run_times.get(record.world_to_camera.tobytes()) for name, record in guessed.items()}
+    views = (replace(view, exposure_time=times.get(view.name) or view.exposure_time) for view in scene.views)
+    return replace(scene, views=tuple(views))
 
 
 def parse_dataset(
@@ -170,15 +182,9 @@ def parse_dataset(
     check_response(dataset, response, path)
     unplaced: list[str] = []
     if records and records[0].lens is UNPLACED:
-        try:
-            dataset, unplaced = with_cameras(dataset, cameras) if cameras else place_photos(dataset, cache)
-        except InputError as error:
-            if dataset.format != "video":
-                raise
-            remedy = "film slowly and in bright light, while you move past things that stand still"
-            raise InputError(root, error.problem.replace("photos", "frames"), remedy) from None  # Not frames in a cache
+        dataset, unplaced = _place(dataset, cameras, cache, root)
         records = list(dataset.records)
-        if unplaced:  # Their times are not to be told of, nor the others' relative to theirs.
+        if unplaced:  # Notes and relative times are to be those of the photos that remain.
             untimed = [replace(record, exposure_time=None, time_known=True) for record in records]
             records, times_known, time_notes = with_times(untimed, folder)
             dataset = replace(dataset, times_known=times_known)
@@ -200,7 +206,24 @@ def parse_dataset(
     return replace(dataset, records=tuple(records), notes=notes, name=name, unplaced=len(unplaced))
 
 
+def _place(
+    dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto], cache: Path | str | None, root: Path
+) -> tuple[DataparserOutputs, list[str]]:
+    """Return bare photos, or frames of the video `root`, with the cameras of a run, or else with found ones.
+
+    The second result names the photos without a camera, which are left out.
+    """
+    try:
+        return with_cameras(dataset, cameras) if cameras else place_photos(dataset, cache)
+    except InputError as error:
+        if dataset.format != "video":
+            raise
+        remedy = "film slowly and in bright light, while you move past things that stand still"
+        raise InputError(root, error.problem.replace("photos", "frames"), remedy) from None  # Not frames in a cache
+
+
 def _folder(path: Path | str) -> Path:
+    """Return the folder of a data set, or a video or transforms.json; raise InputError for anything else."""
     if is_embedded(path):
         return embedded_folder(str(path))
     folder = Path(path)
@@ -283,17 +306,17 @@ def _with_splits(
 
 
 def _held_out(
-    count: int, step: int | None, published: tuple[int, int] | None, uncertain: Collection[int] = ()
+    count: int, step: int | None, protocol: tuple[int, int] | None, uncertain: Collection[int] = ()
 ) -> set[int]:
-    """Return the indices of test views: the published protocol's, or the middle of each block, never the last view.
+    """Return the indices of test views: by `protocol` (every, offset), or the middle of each block, not the last view.
 
     In place of a middle view whose camera is uncertain, the nearest other one of its block is taken, if there is one:
     a camera that is off would count as an error of the scene.
     """
     if step == 0 or count < _FEWEST_FOR_TEST:
         return set()
-    if published is not None:
-        every, offset = step or published[0], published[1]
+    if protocol is not None:
+        every, offset = step or protocol[0], protocol[1]
         return set(range(min(offset, every - 1), count, every))
     step = step or _HOLDOUT
     middles = range(step // 2, count - 1, step) or [count // 2]
