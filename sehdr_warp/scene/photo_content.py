@@ -56,7 +56,7 @@ def unused_bits_note(largest: int, *, linear: bool) -> list[str]:
 
 
 def frame_notes(photos: Sequence[Path], *, masked: bool = False) -> tuple[str, ...]:
-    """Return notes if bare photos are circles in black frames, or have black bars at their edges and are not `masked`.
+    """Return notes if bare photos are circles in black frames, or have bars at their edges and are not `masked`.
 
     Structure from motion does not know the lens of the one, and the other would become part of the scene.
     """
@@ -71,11 +71,11 @@ def frame_notes(photos: Sequence[Path], *, masked: bool = False) -> tuple[str, .
         note = "photos are circles in black frames, as of a fisheye lens, but their cameras are found as of a usual"
         return (f"{note} lens: bring cameras of COLMAP's OPENCV_FISHEYE, or convert the photos to usual ones",)
     sides = {"top": 0, "right": 1, "bottom": 2, "left": 3}  # Quarter turns that bring a side to the top
-    bars = [side for side, turns in sides.items() if _have_bars([np.rot90(codes, turns) for codes in pictures])]
-    if masked or not bars:
-        return ()
-    note = f"photos have black bars ({', '.join(bars)}), which become part of the scene"
-    return (f"{note}: crop them off, or leave them out by a mask.png that is black there",)
+    for color, codes in () if masked else (("black", pictures), ("white", [255 - each for each in pictures])):
+        if bars := [side for side, turns in sides.items() if _have_bars([np.rot90(each, turns) for each in codes])]:
+            note = f"photos have {color} bars ({', '.join(bars)}), which become part of the scene"
+            return (f"{note}: crop them off, or leave them out by a mask.png that is black there",)
+    return ()
 
 
 def _thumbnail(photo: Path) -> np.ndarray:

@@ -46,17 +46,19 @@ def test_circles_in_black_frames_are_told_of(tmp_path, inner, told):
 
 
 @pytest.mark.parametrize(("top", "left", "bars"), [(30, 0, "top, bottom"), (0, 40, "right, left"), (2, 2, "")])
-def test_black_bars_are_told_of(tmp_path, top, left, bars):
+@pytest.mark.parametrize("color", ["black", "white"])
+def test_bars_are_told_of(tmp_path, color, top, left, bars):
     """Frames of wide films have them; a backdrop around an object ends elsewhere in each photo."""
+    bar = 255 if color == "white" else 0
     photos = [tmp_path / f"{i}.jpg" for i in range(3)]
     for i, photo in enumerate(photos):
-        codes = np.zeros((240, 320, 3), np.uint8)
-        codes[top : 240 - top, left : 320 - left] = np.maximum(pattern(320 - 2 * left, 240 - 2 * top, i), 60)
+        codes = np.full((240, 320, 3), bar, np.uint8)
+        codes[top : 240 - top, left : 320 - left] = np.clip(pattern(320 - 2 * left, 240 - 2 * top, i), 60, 195)
         Image.fromarray(codes).save(photo)
     notes = frame_notes(photos)
-    assert [note.split(")")[0] for note in notes] == [f"photos have black bars ({bars}"] * bool(bars)
+    assert [note.split(")")[0] for note in notes] == [f"photos have {color} bars ({bars}"] * bool(bars)
     assert not frame_notes(photos, masked=True)
-    codes[: top + 20] = codes[220 - top :] = codes[:, : left + 20] = codes[:, 300 - left :] = 0
+    codes[: top + 20] = codes[220 - top :] = codes[:, : left + 20] = codes[:, 300 - left :] = bar
     Image.fromarray(codes).save(photo)
     assert not frame_notes(photos)
 
