@@ -52,14 +52,14 @@ _POSE_FILES = {
     "registration.csv": "RealityCapture", "mesh_info.json": "Polycam",
     "metadata.json": "Record3D", "arposes.txt": "ARKit", "cams": "MVSNet", "cameras_sphere.npz": "NeuS",
     "cameras.npz": "IDR", "pose": "NSVF", "camera": "Nerfies", "dslr": "ScanNet++", "groundtruth.txt": "TUM",
-    "traj.txt": "Replica", "images.lst": "RealityScan", "_par.txt": "Middlebury",
+    "pose.txt": "TUM", "traj.txt": "Replica", "images.lst": "RealityScan", "_par.txt": "Middlebury",
 }  # fmt: skip
 # What files of any name hold that state cameras.
 _POSE_CONTENT = (
     (".csv", b"#name,x,y", "RealityScan"), (".json", b'"cameraPoseARFrame"', "3D Scanner App"),
     (".json", b'"intrinsicId"', "Meshroom"), (".json", b'"sfm_data_version"', "OpenMVG"),
     (".nvm", b"NVM_V3", "VisualSFM"), (".out", b"Bundle file", "Bundler"),
-    (".xml", b"<chunk", "Metashape"), (".xmp", b"xcr:", "RealityScan"),
+    (".txt", b"tx ty tz qx qy qz qw", "TUM"), (".xml", b"<chunk", "Metashape"), (".xmp", b"xcr:", "RealityScan"),
 )  # fmt: skip
 _MEDIA = frozenset().union(VIDEO_SUFFIXES, UNSTITCHED_SUFFIXES, HEIF_SUFFIXES)  # May be meant beside a folder of photos
 _CAMERA_FOLDER = re.compile(r"\d{6}_[a-z_]|\d{3}([a-z0-9_]{5})")  # 202410__ of an iPhone, and 100CANON

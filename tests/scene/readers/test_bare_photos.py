@@ -165,7 +165,7 @@ def test_grey_photos_of_a_conference_room_are_photos(tmp_path):
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
     ("Registration.csv", "RealityCapture"), ("frame_00000.json", "3D Scanner App"),
-    ("dinoSR_par.txt", "Middlebury"),
+    ("dinoSR_par.txt", "Middlebury"), ("pose.txt", "TUM"),
 ])  # fmt: skip
 def test_poses_of_other_programs_are_named(tmp_path, file, tool):
     photos(tmp_path)
@@ -177,11 +177,17 @@ def test_poses_of_other_programs_are_named(tmp_path, file, tool):
 
 @pytest.mark.parametrize("file, content, tool", [
     ("views.json", '{"views": [{"intrinsicId": "1"}]}', "Meshroom"), ("a.json", '{"sfm_data_version": 1}', "OpenMVG"),
-    ("dense.nvm", "NVM_V3", "VisualSFM"), ("bundle/bundle.out", "# Bundle file v0.3", "Bundler"),
+    ("dense.nvm", "NVM_V3", "VisualSFM"), ("bundle/a.out", "# Bundle file v0.3", "Bundler"),
+    ("project.xml", "<document><chunk></chunk></document>", "Metashape"),
+    ("castle.csv", "#name,x,y,alt,heading,pitch,roll,f\n", "RealityScan"),
+    ("IMG_0.xmp", '<rdf:Description xcr:Version="3"/>', "RealityScan"),
+    ("room.txt", "# timestamp tx ty tz qx qy qz qw\n0.1 1 2 3 0 0 0 1\n", "TUM"),
 ])  # fmt: skip
 def test_poses_of_other_programs_are_known_by_their_content(tmp_path, file, content, tool):
     photos(tmp_path)
     (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text("<x/>")
+    assert not find_photos(tmp_path).notes
     (tmp_path / file).write_text(content)
     name = Path(file).name
     assert any(note.startswith(f"poses of {tool} ({name}) are not read") for note in find_photos(tmp_path).notes)
@@ -354,22 +360,6 @@ def test_jpegs_under_their_other_suffixes(tmp_path, suffix):
     for i in range(3):
         Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"{i}{suffix}", "JPEG")
     assert len(find_photos(tmp_path).records) == 3
-
-
-@pytest.mark.parametrize(
-    "file, content, tool",
-    [
-        ("project.xml", "<document><chunk></chunk></document>", "Metashape"),
-        ("castle.csv", "#name,x,y,alt,heading,pitch,roll,f\n", "RealityScan"),
-        ("IMG_0.xmp", '<rdf:Description xcr:Version="3"/>', "RealityScan"),
-    ],
-)
-def test_poses_of_other_programs_are_known_by_content(tmp_path, file, content, tool):
-    photos(tmp_path)
-    (tmp_path / file).write_text("<x/>")
-    assert not find_photos(tmp_path).notes
-    (tmp_path / file).write_text(content)
-    assert find_photos(tmp_path).notes[0].startswith(f"poses of {tool} ({file}) are not read")
 
 
 def test_the_folder_of_photos_in_place_of_its_set(tmp_path):
