@@ -67,8 +67,8 @@ class Adam:
             active_count: [1] int32, number of Gaussians, if parameters have more rows; the gradients of the other rows
                 are 0.
         """
-        grouped = self._with_gradient(factored=harmonics is not None)
-        parameters = [parameter for _, parameter in grouped]
+        pairs = self._with_gradient(factored=harmonics is not None)
+        parameters = [parameter for _, parameter in pairs]
         if flags is None:
             flags = StepFlags(parameters[0].new_zeros(()), parameters[0].new_ones(()))
         self._create_states(parameters)
@@ -77,7 +77,7 @@ class Adam:
         torch._foreach_add_(steps, [flags.applied] * len(steps))  # pyright: ignore[reportPrivateImportUsage]
         steps_with_gradient = []
         options: dict = {"betas": self.betas, "epsilon": EPSILON, "active_count": active_count}
-        for group, parameter in grouped:
+        for group, parameter in pairs:
             first, second, step = (self.state[parameter][key] for key in ("exp_avg", "exp_avg_sq", "step"))
             values = _first_rows(parameter.detach(), first)
             if parameter.grad is not None:

@@ -135,16 +135,16 @@ def _with_all_times(
     scene: Scene, records: Mapping[str, ImageRecord], cameras: Sequence[PlacedPhoto], response: "Response"
 ) -> Scene:
     """Return a scene with exposure times for photos, by name, that state none: those of a run, or else estimates."""
-    guessed = {name: record for name, record in records.items() if not record.time_known}
-    if not guessed:
+    without_time = {name: record for name, record in records.items() if not record.time_known}
+    if not without_time:
         return scene
     if not cameras:
         from .exposure.estimate import with_estimated_times
 
-        return with_estimated_times(scene, guessed, response)
+        return with_estimated_times(scene, without_time, response)
     # The training estimated them by points of structure from motion, which are not here.
     run_times = {camera.world_to_camera.tobytes(): camera.exposure_time for camera in cameras}
-    times = {name: run_times.get(record.world_to_camera.tobytes()) for name, record in guessed.items()}
+    times = {name: run_times.get(record.world_to_camera.tobytes()) for name, record in without_time.items()}
     views = (replace(view, exposure_time=times.get(view.name) or view.exposure_time) for view in scene.views)
     return replace(scene, views=tuple(views))
 
@@ -185,8 +185,8 @@ def parse_dataset(
         dataset, unplaced = _place(dataset, cameras, cache, root)
         records = list(dataset.records)
         if unplaced:  # Notes and relative times are to be those of the photos that remain.
-            untimed = [replace(record, exposure_time=None, time_known=True) for record in records]
-            records, times_known, time_notes = with_times(untimed, folder)
+            reset = [replace(record, exposure_time=None, time_known=True) for record in records]
+            records, times_known, time_notes = with_times(reset, folder)
             dataset = replace(dataset, times_known=times_known)
     pose_notes: list[str] = []
     if dataset.format in POSED:
@@ -260,20 +260,20 @@ def _read(folder: Path, *, scans: bool) -> DataparserOutputs:
 
     usual = find_model(folder)
     model = usual or find_model(folder, anywhere=True)
-    posed = model if model is not None and has_images(model) else None
-    beside = posed is not None and posed.is_relative_to(folder / "sparse") and image_folder(folder) is not None
+    poses = model if model is not None and has_images(model) else None
+    beside = poses is not None and poses.is_relative_to(folder / "sparse") and image_folder(folder) is not None
     readers = (
         (has("transforms_train.json", "exposure_train.json"), read_hdr_nerf),
         (has("poses_bounds_exps.npy"), read_hdr_nerf_real),
         (is_hdr_gs(folder, usual), partial(read_hdr_gs, model=usual)),
         (beside, partial(read_colmap, source=model)),
         (has("transforms.json") or has("transforms_train.json"), read_transforms),
-        (posed is not None and model_fits(folder, posed), partial(read_colmap, source=model)),
+        (poses is not None and model_fits(folder, poses), partial(read_colmap, source=model)),
         (find_reconstruction(folder) is not None, read_opensfm),
         (has("poses_bounds.npy"), read_llff),
         (scans and find_sfm(folder) is not None, read_meshroom),
         (scans and find_scan(folder) is not None, read_scan),
-        (model != posed, partial(read_colmap, source=model)),  # Refused: nothing else has poses.
+        (model != poses, partial(read_colmap, source=model)),  # Refused: nothing else has poses.
     )
     reader = next((reader for fits, reader in readers if fits), None)
     if reader is None and model is None and (inner := inner_folder(folder)) is not None:
@@ -281,7 +281,7 @@ def _read(folder: Path, *, scans: bool) -> DataparserOutputs:
         dataset = _read(inner, scans=scans)
         return replace(dataset, folder=inner, notes=(note, *dataset.notes))
     dataset = (reader or find_photos)(folder)
-    if model is not None and posed is None:
+    if model is not None and poses is None:
         note = f"{model.relative_to(folder)} has no images.bin or images.txt: its cameras are not used"
         dataset = replace(dataset, notes=(*dataset.notes, note))
     return dataset

@@ -41,8 +41,8 @@ class Evaluation(NamedTuple):
 
 def evaluations(metrics: Sequence[Mapping[str, Any]]) -> list[Evaluation]:
     """Return the evaluations of held-out photos in the lines of metrics.jsonl."""
-    scored = [(line["iteration"], line.get("psnr_ldr")) for line in metrics if line.get("split", "test") == "test"]
-    return [Evaluation(iteration, psnr) for iteration, psnr in scored if psnr is not None]
+    scores = [(line["iteration"], line.get("psnr_ldr")) for line in metrics if line.get("split", "test") == "test"]
+    return [Evaluation(iteration, psnr) for iteration, psnr in scores if psnr is not None]
 
 
 def best_if_overfitted(points: Sequence[Evaluation]) -> Evaluation | None:
@@ -122,8 +122,8 @@ class FinishedTraining:
                 return [f"{problem}: {likely}; {remedy}"]
             if gain > STILL_RISING:
                 command = f"sehdr-warp train --resume --out {run} --iterations {2 * iterations}"
-                gained = f"held-out photos gained {gain:.1f} dB since iteration {before.iteration}"
-                lines.append(f"{gained}; more steps help: {command}")
+                rise = f"held-out photos gained {gain:.1f} dB since iteration {before.iteration}"
+                lines.append(f"{rise}; more steps help: {command}")
             elif best := best_if_overfitted(points):
                 better = f"{best.psnr - points[-1].psnr:.1f} dB better at iteration {best.iteration}"
                 remedy = f"add photos from other places, or stop there: {self._command(self.scene, best.iteration)}"

@@ -213,9 +213,9 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
             # Iterating the trainer trains; serve_training() answers browsers between its steps.
             run_with_progress(steps, trainer.total)
     options = {"response": args.scene.response, "preset": args.training.preset, "seed": args.training.seed}
-    repeated = options_of_run(trainer.run) if output.resume else used_fields(args.fields) | options
-    repeated |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
-    _print_result(args, trainer.run, advice_on(trainer, data, repeated))
+    command_options = options_of_run(trainer.run) if output.resume else used_fields(args.fields) | options
+    command_options |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
+    _print_result(args, trainer.run, advice_on(trainer, data, command_options))
 
 
 def _print_plan(args: Train) -> None:

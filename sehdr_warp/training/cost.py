@@ -121,11 +121,11 @@ def block_cost(work: Workload, blocks: int, gpus: int = 1) -> Cost:
     )
     one = training_cost(block)
     rounds = math.ceil(blocks / gpus)
-    merged = STATE_BYTES / 4 * work.gaussians
+    merged_bytes = STATE_BYTES / 4 * work.gaussians
     return replace(
         one,
         seconds=rounds * one.seconds,
-        disk_bytes=blocks * one.disk_bytes + merged,
+        disk_bytes=blocks * one.disk_bytes + merged_bytes,
         photo_bytes=one.photo_bytes * min(gpus, blocks),
         predicted=one.predicted or gpus > MOST_GPUS,
     )
@@ -180,8 +180,8 @@ def choices(whole: Workload, divided: Workload, blocks: int, memory: float | Non
     costs = {f"{count} GPU" + "s" * (count > 1): training_cost(whole, count) for count in sorted({1, 2, 4, 8, gpus})}
     costs["8 nodes of 8 GPUs"] = training_cost(whole, 64, 8)
     alone = costs["1 GPU"].seconds
-    listed = "1 GPU", f"{gpus} GPUs"
-    costs = {name: cost for name, cost in costs.items() if name in listed or alone > SAVES * cost.seconds}
+    names = "1 GPU", f"{gpus} GPUs"
+    costs = {name: cost for name, cost in costs.items() if name in names or alone > SAVES * cost.seconds}
     for count in sorted({1, gpus, min(blocks, 8)}) if blocks > 1 else ():
         costs[f"{blocks} blocks on {count} GPU" + "s" * (count > 1)] = block_cost(divided, blocks, count)
     return [Choice(name, cost, memory is None or cost.gpu_bytes <= memory) for name, cost in costs.items()]

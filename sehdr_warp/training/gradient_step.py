@@ -209,12 +209,12 @@ class GradientStep:
         if options.size_weight and not self._spares_unseen:
             loss = loss + size_loss(field.gaussians, options.size_weight)
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in it.
-        dropped = {"image", "transmittance", "depths"}
+        names = {"image", "transmittance", "depths"}
         if options.needs_means2d_grad:
             render.rendering.means2d.retain_grad()
         else:
-            dropped |= {"means2d", "extents"}
-        rendering = replace(render.rendering, **dict.fromkeys(dropped))
+            names |= {"means2d", "extents"}
+        rendering = replace(render.rendering, **dict.fromkeys(names))
         image = compared_image(render, target)
         del render, target, view
         differentiate(loss)
@@ -241,8 +241,8 @@ class GradientStep:
         overflow = rendering.overflow
         if self._flat_gradients is not None:
             loss, overflow, harmonics = self._flat_gradients.distribute()
-        groups, factored = self.optimizer.param_groups, [] if harmonics is None else [harmonics.grad_colors]
-        grads = [p.grad for group in groups for p in group["params"] if p.grad is not None] + factored
+        groups, color_gradients = self.optimizer.param_groups, [] if harmonics is None else [harmonics.grad_colors]
+        grads = [p.grad for group in groups for p in group["params"] if p.grad is not None] + color_gradients
         flags = decide_step(loss, finiteness_of(grads), overflow, self.step_counters, rendering.needed_intersections)
         self.optimizer.step(flags, harmonics, self.field.gaussians.active_count)
         if rendering.means2d is not None:

@@ -187,9 +187,9 @@ def check_fields(scene: Scene, config: Config) -> None:
 
     if "fusion.exposures" in user_fields:
         base = base_time_of(scene)
-        timed = [item for item in config.fusion.exposures if is_seconds(item)]
-        if timed and not scene.exposure_times_known:
-            problem = f"{timed[0]} is a time and the photos state none"
+        times = [item for item in config.fusion.exposures if is_seconds(item)]
+        if times and not scene.exposure_times_known:
+            problem = f"{times[0]} is a time and the photos state none"
             refuse("fusion.exposures", problem, "write multiples of their exposure (1/8x) or stops from it (-3ev)")
         for time in exposure_times(base, config.fusion.exposures):
             if not 1 / MAX_EXPOSURE_RATIO <= time / base <= MAX_EXPOSURE_RATIO:
@@ -215,10 +215,10 @@ def _response(facts: SceneFacts, config: Config, device: torch.device) -> Decisi
 
 def _light(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     if not (facts.unclipped and facts.truths == facts.photos and config.loss.ldr_weight):
-        unneeded: dict[str, object] = (
+        zero_weights: dict[str, object] = (
             {} if facts.clipped else dict.fromkeys(("loss.clipped_smoothness", "loss.clipped_estimate"), 0.0)
         )
-        return Decision(unneeded, "from the photos", f"{facts.clipped:.1%} of the pixels are clipped")
+        return Decision(zero_weights, "from the photos", f"{facts.clipped:.1%} of the pixels are clipped")
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
     reason = f"{facts.truths} float pictures have any brightness: on a photo's curve, errors of highlights count little"
     return Decision(fields, "in the mu-law", reason)

@@ -47,9 +47,9 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
     kernels have their own threads, and the interpreter's lock is handed over sooner. If `deterministic`, sums on a GPU
     have a fixed order too.
     """
-    threads, ordered = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    threads, was_deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     memory: Any = torch.utils.deterministic
-    filled = memory.fill_uninitialized_memory
+    fills_memory = memory.fill_uninitialized_memory
     interval = sys.getswitchinterval()
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_SECONDS)
@@ -66,8 +66,8 @@ def torch_settings(deterministic: bool) -> Iterator[None]:
         sys.setswitchinterval(interval)
         _keep_memory(False)
         if deterministic:  # Guarded, because the call loads torch's compiler, two seconds.
-            torch.use_deterministic_algorithms(ordered)
-        memory.fill_uninitialized_memory = filled
+            torch.use_deterministic_algorithms(was_deterministic)
+        memory.fill_uninitialized_memory = fills_memory
 
 
 def _keep_memory(keep: bool) -> None:
@@ -102,14 +102,14 @@ def interruptible() -> Iterator[threading.Event]:
     signals = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     # Signals that nohup or a background shell ignores stay ignored.
     previous = {each: old for each in signals if (old := signal.getsignal(each)) not in (signal.SIG_IGN, None)}
-    caught = []
+    signal_numbers = []
 
     def restore():
         for each, handler in previous.items():
             signal.signal(each, handler)
 
     def on_signal(number, _):
-        caught.append(number)
+        signal_numbers.append(number)
         event.set()
         restore()
 
@@ -118,12 +118,12 @@ def interruptible() -> Iterator[threading.Event]:
     try:
         yield event
     except Exception:
-        caught.clear()  # The exception is reported instead of the signal.
+        signal_numbers.clear()  # The exception is reported instead of the signal.
         raise
     finally:
         restore()
-        if caught:
-            signal.raise_signal(caught[0])
+        if signal_numbers:
+            signal.raise_signal(signal_numbers[0])
 
 
 def summary_writer() -> type:

@@ -91,11 +91,11 @@ class Ranks:
         self.store.set(keys[self.rank], platform.node())
         began, logged_once = time.monotonic(), False
         while not self.store.check(keys):
-            waited = time.monotonic() - began
-            if waited > WAITING_NOTICE and not logged_once:
+            seconds = time.monotonic() - began
+            if seconds > WAITING_NOTICE and not logged_once:
                 self._log_wait()
                 logged_once = True
-            if waited > self._timeout:
+            if seconds > self._timeout:
                 absent = [rank for rank, key in enumerate(keys) if not self.store.check([key])]
                 nodes = ", ".join(str(node) for node in sorted({self.info.node_of(rank) for rank in absent}))
                 problem = f"{self.info} waited {self._timeout:.0f} s ({TIMEOUT}) for rank {absent[0]}"
@@ -115,9 +115,9 @@ class Ranks:
         self._deadline = time.monotonic() + self._timeout if self.is_main_process else None
         with self._collective():
             dist.all_reduce(answer, dist.ReduceOp.MIN, group=self._hosts)
-        agreed = int(answer)
-        self._deadline = time.monotonic() + self._timeout if agreed == GO else None
-        return agreed
+        lowest = int(answer)
+        self._deadline = time.monotonic() + self._timeout if lowest == GO else None
+        return lowest
 
     def shutdown(self) -> None:
         """End a training: wait until all ranks have called this, because leaving early breaks off pending transfers."""

@@ -229,8 +229,8 @@ def resumed_config(folder: RunWriter, config: Config | None) -> Config:
     if config.plan.enabled:
         fields = {path: value for decision in folder.read_decisions() for path, value in decision["fields"].items()}
         fields |= {path: attrgetter(path)(saved) for path, _ in config_fields() if path in fields}
-        decided = {path: value for path, value in fields.items() if path not in config.plan.keep}
-        config = override_config(config, decided | {"plan.enabled": False}, folder.plan_file)
+        plan_fields = {path: value for path, value in fields.items() if path not in config.plan.keep}
+        config = override_config(config, plan_fields | {"plan.enabled": False}, folder.plan_file)
     iterations = max(saved.schedule.iterations, config.schedule.iterations)
     saved = override_config(saved, {"schedule.iterations": iterations})
     require_same_config(config, saved, folder.config_file, "resume with the run's own config, or train anew")

@@ -194,12 +194,12 @@ class Trainer:
 
     def _agree_to_continue(self) -> bool:
         """Return whether there is a next step. Any rank may end the training, and rank 0 may make the others wait."""
-        agreed = END if self._ranks_ended else WAIT
-        while agreed == WAIT:
-            agreed = GO if self.iteration < self.total and not self.ending else END
+        signal = END if self._ranks_ended else WAIT
+        while signal == WAIT:
+            signal = GO if self.iteration < self.total and not self.ending else END
             if self.ranks is not None:
-                agreed = self.ranks.all_reduce_min(agreed)
-        return agreed == GO
+                signal = self.ranks.all_reduce_min(signal)
+        return signal == GO
 
     def _estimate_seconds_left(self, step_seconds: float) -> float | None:
         """Return the estimated time to the end after a step; None after the first, because that compiles kernels."""

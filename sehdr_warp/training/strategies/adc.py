@@ -51,22 +51,22 @@ class AdcStrategy(Strategy):
     @torch.no_grad()
     def refine(self, iteration, gaussians, optimizer, generator, make_seeds=None, step_batch=1) -> bool:
         """Duplicate, split and remove Gaussians, and reset opacities, if this iteration is due."""
-        changed = False
+        is_refinement = False
         total, count = self.gradient_sum, self.photo_count
         if self.schedule.is_due(iteration, step_batch) and total is not None and count is not None:
-            changed = True
+            is_refinement = True
             small, large = self._select(gaussians, (total / count.clamp_min(1))[: gaussians.count])
             parents = large.nonzero()[:, 0]
-            added = [gaussians.rows(small.nonzero()[:, 0])]
-            added += [sample_half(gaussians, parents, generator) for _ in range(2)]
-            added = {name: torch.cat([rows[name] for rows in added]) for name in PARAMETER_NAMES}
-            self.remove(gaussians, optimizer, large, added, oversized=iteration > self.reset_every)
+            new_rows = [gaussians.rows(small.nonzero()[:, 0])]
+            new_rows += [sample_half(gaussians, parents, generator) for _ in range(2)]
+            new_rows = {name: torch.cat([rows[name] for rows in new_rows]) for name in PARAMETER_NAMES}
+            self.remove(gaussians, optimizer, large, new_rows, oversized=iteration > self.reset_every)
             # In place, because captured steps add to these tensors.
             total.zero_()
             count.zero_()
         if self._resets(iteration, step_batch):
             self.reset_opacities(gaussians, optimizer)
-        return changed
+        return is_refinement
 
     def is_due(self, iteration: int, step_batch: int = 1) -> bool:
         """Return whether a step of `step_batch` iterations that ends at `iteration` refines or resets opacities."""
@@ -82,20 +82,20 @@ class AdcStrategy(Strategy):
 
         If the cap leaves room for fewer, those with the largest gradients are selected.
         """
-        selected = gradient > self.options.grow_grad2d
+        candidates = gradient > self.options.grow_grad2d
         room = self.cap_max - gaussians.count
-        if int(selected.sum()) > room:
+        if int(candidates.sum()) > room:
             first = gradient.topk(max(room, 0)).indices
-            selected = torch.zeros_like(selected).index_fill_(0, first, True) & selected
+            candidates = torch.zeros_like(candidates).index_fill_(0, first, True) & candidates
         small = gaussians.log_scales.amax(1) <= math.log(self.options.grow_scale3d)
-        return selected & small, selected & ~small
+        return candidates & small, candidates & ~small
 
     def remove(
         self,
         gaussians: Gaussians,
         optimizer: Optimizer | None,
         split: Tensor,
-        added: dict[str, Tensor],
+        new_rows: dict[str, Tensor],
         *,
         oversized: bool,
     ) -> None:
@@ -104,15 +104,15 @@ class AdcStrategy(Strategy):
         Among the new ones, those that would be removed are not appended. If nothing would be left, only split ones are
         removed.
         """
-        remaining, appended = ~split, added
+        remaining, rows = ~split, new_rows
         good = remaining & self._is_good(gaussians.tensors(), oversized)
-        index = self._is_good(added, oversized).nonzero()[:, 0]
+        index = self._is_good(new_rows, oversized).nonzero()[:, 0]
         if len(index) or bool(good.any()):
-            remaining, appended = good, {name: values[index] for name, values in added.items()}
+            remaining, rows = good, {name: values[index] for name, values in new_rows.items()}
         if not bool(remaining.all()):
             gaussians.keep_only(remaining, optimizer)
-        if len(appended["means"]):
-            gaussians.append(appended, optimizer)
+        if len(rows["means"]):
+            gaussians.append(rows, optimizer)
 
     def _is_good(self, rows: dict[str, Tensor], oversized: bool) -> Tensor:
         """Return a mask of rows that are neither transparent nor, if that counts, oversized."""

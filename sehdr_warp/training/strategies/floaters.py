@@ -42,8 +42,8 @@ class TrainingCameras(NamedTuple):
 
     def used_by(self, options: McmcConfig) -> "TrainingCameras | None":
         """Return the cameras by which floater_mask() finds floaters, None if there are none."""
-        used = options.prune_near_points * self.nearest_points > 0
-        return TrainingCameras(*(each[used] for each in self)) if used.any() else None
+        mask = options.prune_near_points * self.nearest_points > 0
+        return TrainingCameras(*(each[mask] for each in self)) if mask.any() else None
 
 
 def distances_of_points(views: Sequence[View], points: np.ndarray) -> list[float]:

@@ -58,31 +58,31 @@ class McmcStrategy(Strategy):
     def refine(self, iteration, gaussians, optimizer, generator, make_seeds=None, step_batch=1) -> bool:
         """Relocate dead Gaussians and add new ones.
 
-        The slots are filled from the first on: [0, seeded) by seeds, [seeded, dead_count) by copies of living
-        Gaussians, and the new rows that are left, up to dead_count + added, by copies sampled by opacity. Only the
+        The slots are filled from the first on: [0, seed_count) by seeds, [seed_count, dead_count) by copies of living
+        Gaussians, and the new rows that are left, up to dead_count + new_count, by copies sampled by opacity. Only the
         device knows how many Gaussians are dead, so these counts stay there.
         """
         count = gaussians.count
         opacities = gaussians.opacities()
-        added = self.next_count(iteration, count) - count
-        if added > 0:  # The only value that the host waits for
-            added = min(added, max(0, int(opacities.sum() / LEAST_MEAN_OPACITY) - count))
+        new_count = self.next_count(iteration, count) - count
+        if new_count > 0:  # The only value that the host waits for
+            new_count = min(new_count, max(0, int(opacities.sum() / LEAST_MEAN_OPACITY) - count))
         dead = opacities <= self.prune_opacity
         if self.cameras is not None:
             dead |= floater_mask(gaussians, self.cameras, self.options)
-        slot_of_row, dead_count = number_slots(dead, added)
-        gaussians.resize(count + added, optimizer)
+        slot_of_row, dead_count = number_slots(dead, new_count)
+        gaussians.resize(count + new_count, optimizer)
         changed = torch.zeros_like(slot_of_row, dtype=torch.bool)
         refinement = Refinement(gaussians, optimizer, generator, slot_of_row, changed)
-        seeded = self.place_seeds(refinement, dead_count, added, make_seeds)
-        self.relocate(refinement, opacities.masked_fill(dead, 0), seeded, dead_count, count)
-        if added > 0:
-            first = torch.maximum(dead_count, seeded)
+        seed_count = self.place_seeds(refinement, dead_count, new_count, make_seeds)
+        self.relocate(refinement, opacities.masked_fill(dead, 0), seed_count, dead_count, count)
+        if new_count > 0:
+            first = torch.maximum(dead_count, seed_count)
             weights = gaussians.opacities().masked_fill_(slot_of_row >= first, 0)
-            self.relocate(refinement, weights, first, dead_count + added, added)
+            self.relocate(refinement, weights, first, dead_count + new_count, new_count)
         left = SECOND_MOMENT_LEFT_WHERE_DENSE if self.dense else SECOND_MOMENT_LEFT
         reset_moments(gaussians, optimizer, changed, left)
-        return added > 0
+        return new_count > 0
 
     def next_count(self, iteration: int, count: int) -> int:
         """Return the count after the refinement at an iteration.
@@ -95,20 +95,20 @@ class McmcStrategy(Strategy):
             growth = max(growth, min((self.cap_max / count) ** (1 / remaining) - 1, MAX_GROWTH))
         return max(count, min(self.cap_max, math.ceil((1 + growth) * count)))
 
-    def place_seeds(self, refinement: Refinement, dead_count: Tensor, added: int, make: MakeSeeds | None) -> Tensor:
+    def place_seeds(self, refinement: Refinement, dead_count: Tensor, new_count: int, make: MakeSeeds | None) -> Tensor:
         """Fill the first slots with seeds; return their number, int64 []."""
         fraction, none = self.options.seed_fraction, torch.zeros_like(dead_count)
         if make is None or not fraction:
             return none
-        number = (fraction * (dead_count + added).double()).long()
+        number = (fraction * (dead_count + new_count).double()).long()
         bound = host_bound(number, int(fraction * refinement.gaussians.count))
         if not bound:
             return none
-        rows, seeded = make(number, bound)
+        rows, seed_count = make(number, bound)
         values = list(refinement.gaussians.tensors().values())
         rows = [rows[name] for name in PARAMETER_NAMES]
-        copy_rows(values, rows, refinement.slot_of_row, none, seeded, changed=refinement.changed)
-        return seeded
+        copy_rows(values, rows, refinement.slot_of_row, none, seed_count, changed=refinement.changed)
+        return seed_count
 
     def relocate(self, refinement: Refinement, weights: Tensor, first: Tensor, last: Tensor, bound: int) -> None:
         """Fill the slots [first, last), at most `bound`, none if first > last, with Gaussians sampled by weights [N].
