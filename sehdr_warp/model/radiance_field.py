@@ -21,7 +21,7 @@ from .gaussians import Gaussians
 from .pixel_filter import EPS2D, FocalRange, keep_light
 from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView
 
-_DECODED_AT_ONCE = 1 << 19  # Pixels
+_PIXELS_AT_ONCE = 1 << 19  # Of which colors are decoded
 
 
 class RadianceField(nn.Module):
@@ -145,7 +145,7 @@ class RadianceField(nn.Module):
 
     def _color_sets(self, values: Tensor, ratio: float | Tensor, extra_images: frozenset[str]) -> dict[str, Tensor]:
         """Return the colors [N, 3] that a training view needs, by name: any of encoded, exposure and base."""
-        base, exposure = self._exposures(values)  # The same tensor without fusion.
+        base, exposure = self._base_and_hdr(values)  # The same tensor without fusion.
         color_sets = {"exposure": exposure}
         if self.tone_map == "gaussian":
             needs_exposure = "exposure" in extra_images or ("base" in extra_images and self.fusion is None)
@@ -176,10 +176,10 @@ class RadianceField(nn.Module):
         rendering = self._rasterize(tensors, torch.cat([self._blended_colors(tensors.position, degree), depth], dim=1))
         depth = _unpremultiply(rendering.image[..., 3], rendering.alpha).mul_(self.normalization.unit)
         # In bands, because decoding takes many times the memory of what it decodes.
-        image, rows = rendering.image, max(1, _DECODED_AT_ONCE // camera.width)
+        image, rows = rendering.image, max(1, _PIXELS_AT_ONCE // camera.width)
         hdr = image.new_empty(*image.shape[:2], 3)
         for colors, band in zip(image[..., :3].split(rows), hdr.split(rows)):
-            torch.div(self._decoded(colors), self.base_time, out=band)
+            torch.div(self._to_exposures(colors), self.base_time, out=band)
         return RenderedView(hdr, rendering.alpha, depth)
 
     @torch.no_grad()
@@ -237,7 +237,7 @@ class RadianceField(nn.Module):
         distance, *confidence = (_unpremultiply(image[..., i], alpha) for i in range(3, image.shape[2]))
         confidence = confidence[0].clamp(0, 1) if confidence else None
         distance = distance * self.normalization.unit
-        hdr = self._decoded(image[..., :3]) / self.base_time
+        hdr = self._to_exposures(image[..., :3]) / self.base_time
         return DirectionalRender(hdr, alpha, distance, confidence, clipped)
 
     @torch.no_grad()
@@ -268,7 +268,7 @@ class RadianceField(nn.Module):
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
         """Return the radiance [N, 3] of each Gaussian towards a point [3] in scene coordinates."""
         place = torch.tensor(self.normalization.points(position), dtype=torch.float32)
-        return self._decoded(self._blended_colors(place.to(self.gaussians.means.device), degree)) / self.base_time
+        return self._to_exposures(self._blended_colors(place.to(self.gaussians.means.device), degree)) / self.base_time
 
     @without_replays()
     def weighted_sums(self, camera: CameraTensors, images: Tensor, opacities: Tensor | None = None) -> Tensor:
@@ -291,15 +291,15 @@ class RadianceField(nn.Module):
         return spherical_harmonics(sh_degree, coefficients, gaussians.means, position)
 
     def _blended_colors(self, position: Tensor, degree: int | None) -> Tensor:
-        """Return the colors [N, 3] of the HDR image towards a position [3]; see _decoded()."""
+        """Return the colors [N, 3] of the HDR image towards a position [3]; see _to_exposures()."""
         values = self._evaluate_sh(position, degree)
-        return self.color_model.colors(values) if self.color_model.display_referred else self._exposures(values)[1]
+        return self.color_model.colors(values) if self.color_model.display_referred else self._base_and_hdr(values)[1]
 
-    def _decoded(self, colors: Tensor) -> Tensor:
+    def _to_exposures(self, colors: Tensor) -> Tensor:
         """Return the exposures at the base time of colors [..., 3], which may be encoded."""
         return self.response.decode(colors.clamp(0, 1)) if self.color_model.display_referred else colors
 
-    def _exposures(self, values: Tensor) -> tuple[Tensor, Tensor]:
+    def _base_and_hdr(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return exposures [N, 3] at the base time of each Gaussian's base color and of its HDR color."""
         base = self.color_model.colors(values)
         if self.fusion is None:

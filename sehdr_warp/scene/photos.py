@@ -178,7 +178,8 @@ def photo_sizes(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
         return image_sizes(path)
     _refuse_renamed(path)
     if kind == "raw":
-        return read_header(path)[:2]
+        header = read_header(path)
+        return header.size, header.upright_size
     size = hdr_size(path)
     return size, size
 

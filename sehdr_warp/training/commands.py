@@ -198,7 +198,8 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
     request = PhotoRequest(data, config.load_options)
     if saved_config is not None:
         request = request.of_run(saved_config, Response.from_dict(info["response"]), folder.read_cameras())
-        request = request if args.scene.holdout is None else replace(request, cameras=())
+        if args.scene.holdout is not None:  # Its splits are compared with the run's, in place of these.
+            request = replace(request, cameras=())
     check_dataset_truth(data, config)
     device = pick_device(args.machine.device) if ranks is None else ranks.device
     with nullcontext() if device.type != "cpu" else precompiling(config):

@@ -129,7 +129,7 @@ def write_proxy_mesh(
             _write_obj(temporary, mesh, transform, run)
         else:
             with writing_usd(path):
-                _write_usd(temporary, mesh, transform, run)
+                _write_usd(temporary, mesh, transform)
     log.info("%s: %d triangles, voxels of %.3g", path.name, len(mesh.faces), mesh.voxel)
     far = float(np.abs(mesh.vertices).max())
     step = far * 1e-6 if path.suffix.lower() == ".obj" else float(np.spacing(np.float32(far)))  # OBJ has six digits.
@@ -323,7 +323,7 @@ def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "Ren
             file.write("f {} {} {} {}\n".format(*(len(mesh.vertices) + 1 + np.arange(4))))
 
 
-def _write_usd(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "RenderableScene") -> None:
+def _write_usd(path: Path, mesh: ProxyMesh, transform: WorldTransform) -> None:
     """Write an OpenUSD layer; radiance is the displayColor of the mesh."""
     Usd, UsdGeom, Sdf, Vt, Gf = (pxr(name) for name in ("Usd", "UsdGeom", "Sdf", "Vt", "Gf"))
     stage = Usd.Stage.CreateNew(str(path))

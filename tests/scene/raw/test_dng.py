@@ -124,7 +124,8 @@ def test_active_area_and_crop(tmp_path, top, left):
     tags = LEVELS | {50829: longs(top, left, top + HEIGHT - 8, left + WIDTH - 8)}
     tags |= {50719: longs(10, 6), 50720: longs(80, 60)}
     write_tagged_dng(tmp_path / "a.dng", stored(whole), tags)
-    assert read_header(tmp_path / "a.dng")[:2] == ((80, 60), (80, 60))
+    header = read_header(tmp_path / "a.dng")
+    assert header.size == header.upright_size == (80, 60)
     np.testing.assert_allclose(light_of(tmp_path / "a.dng"), gradient[6:66, 10:90], rtol=0.01)
 
 
@@ -136,7 +137,7 @@ def test_orientation(tmp_path, orientation, turn):
     write_tagged_dng(tmp_path / "a.dng", stored(mosaic(gradient)), LEVELS | {274: shorts(orientation)})
     upright, turned = light_of(tmp_path / "a.dng"), light_of(tmp_path / "a.dng", oriented=True)
     np.testing.assert_array_equal(turned, turn(upright))
-    assert read_header(tmp_path / "a.dng")[1] == turned.shape[1::-1]
+    assert read_header(tmp_path / "a.dng").upright_size == turned.shape[1::-1]
 
 
 def test_pixels_that_are_not_square(tmp_path):
