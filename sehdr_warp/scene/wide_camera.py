@@ -17,6 +17,7 @@ from .types import View, codes_of
 
 FACE_ANGLE = 90.0  # Degrees that a view cut from a wide photo shows
 _LEAST_FILLED = 0.3  # Part of a cut view that its photo must show
+_COARSE = 64  # Pixels across a face of which only the camera is used
 WIDEST_PINHOLE = 110.0
 """Degrees: a fisheye lens that sees more keeps its own projection. Undistorted to a pinhole, its border would be lost
 or stretched."""
@@ -140,6 +141,14 @@ def painted_mask(view: View) -> np.ndarray | None:
 def perspective_views(views: Sequence[View]) -> tuple[View, ...]:
     """Return pinhole views for what needs them: pinholes as they are, others cut into faces of FACE_ANGLE degrees."""
     return tuple(face for view in views for face in ((view,) if view.camera.is_pinhole else faces_of(view)))
+
+
+def perspective_cameras(views: Sequence[View]) -> list[Camera]:
+    """Return the cameras of perspective_views(), those of faces with few pixels, without seconds of resampling."""
+    cameras: list[Camera] = []
+    for camera in (view.camera for view in views):
+        cameras += [camera] if camera.is_pinhole else [face.camera for face in face_cameras(camera, _COARSE)]
+    return cameras
 
 
 def faces_of(view: View, size: int | None = None) -> list[View]:

@@ -17,10 +17,10 @@ from ..model.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name
 from ..runs.config import Config
 from ..runs.field import assemble_field
-from ..scene import Scene, View
+from ..scene import Camera, Scene, View
 from ..scene.normalization import Normalization, normalization_of
 from ..scene.response_choice import select_for_views
-from ..scene.wide_camera import perspective_views
+from ..scene.wide_camera import perspective_cameras, perspective_views
 from ..splats import read_gaussians
 from ..subsets import counted, every_nth
 from .matching import Matcher, at_matching_size
@@ -221,11 +221,10 @@ def make_matcher(scene: Scene, response: Response, device: torch.device | str, d
 
 def depth_of_points(scene: Scene) -> float:
     """Return the median depth of the points in the training views, of fewer than FEWEST_POINTS focus_distance()."""
-    views, points = perspective_views(scene.train_views), every_nth(scene.points, MOST_DEPTHS)
+    cameras, points = perspective_cameras(scene.train_views), every_nth(scene.points, MOST_DEPTHS)
     homogeneous = np.c_[points, np.ones(len(points))]
-    depths = [homogeneous[view.camera.project(points).inside] @ view.camera.world_to_camera[2] for view in views]
-    depths = np.concatenate(depths)
-    return float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(views)
+    depths = np.concatenate([homogeneous[each.project(points).inside] @ each.world_to_camera[2] for each in cameras])
+    return float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(cameras)
 
 
 def check_views(scene: Scene) -> None:
@@ -252,9 +251,10 @@ def random_points(scene: Scene, count: int, rng: np.random.Generator) -> tuple[n
         SehdrError: If no two cameras see the same place.
     """
     views = scene.train_views
-    distance, batches, total = focus_distance(views), [], 0
+    cameras = [view.camera for view in views]
+    distance, batches, total = focus_distance(cameras), [], 0
     for _ in range(8):
-        points = points_on_rays(views, count, distance, rng)
+        points = points_on_rays(cameras, count, distance, rng)
         visible, mean = colors_in_views(points, views)
         batches.append((points[visible >= 2], mean[visible >= 2]))
         total += len(batches[-1][0])
@@ -266,13 +266,13 @@ def random_points(scene: Scene, count: int, rng: np.random.Generator) -> tuple[n
     return points, colors
 
 
-def focus_distance(views: tuple[View, ...]) -> float:
+def focus_distance(cameras: Sequence[Camera]) -> float:
     """Return the median distance from the cameras to the point nearest to all their axes, world units, positive.
 
     If they do not look at a common point, it is twice the spread of the cameras.
     """
-    origins = np.stack([view.camera.position for view in views])
-    axes = np.stack([view.camera.world_to_camera[2, :3] for view in views])
+    origins = np.stack([camera.position for camera in cameras])
+    axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
     spread = float(np.linalg.norm(origins - origins.mean(0), axis=1).max())
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     focus = np.linalg.lstsq(across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0], rcond=1e-4)[0]
@@ -280,14 +280,14 @@ def focus_distance(views: tuple[View, ...]) -> float:
     return float(np.median(ahead)) if np.median(ahead) > 0.2 * spread else max(2 * spread, 1e-3)
 
 
-def points_on_rays(views, count: int, distance: float, rng: np.random.Generator) -> np.ndarray:
-    """Return [N, 3] points in front of the cameras, uniform over views, pixels and inverse depth within DEPTH_RANGE."""
+def points_on_rays(cameras: Sequence[Camera], count: int, distance: float, rng: np.random.Generator) -> np.ndarray:
+    """Return [N, 3] points in front of cameras, uniform over these, pixels and inverse depth within DEPTH_RANGE."""
     near, far = (factor * distance for factor in DEPTH_RANGE)
-    view_indices = rng.integers(len(views), size=count)
+    camera_indices = rng.integers(len(cameras), size=count)
     across, depth = rng.random((count, 2)), 1 / rng.uniform(1 / far, 1 / near, count)
     points = np.empty((count, 3))
-    for index, view in enumerate(views):
-        mine, camera = view_indices == index, view.camera
+    for index, camera in enumerate(cameras):
+        mine = camera_indices == index
         x, y = across[mine, 0] * camera.width, across[mine, 1] * camera.height
         points[mine] = camera.unproject(x, y, depth[mine])
     return points

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..scene import Scene, View, encoded_values
+from ..scene import Camera, Scene, View, encoded_values
 from ..scene.images.exif import are_camera_jpegs
 from ..scene.images.ldr_files import file_kind
-from ..scene.wide_camera import perspective_views
+from ..scene.wide_camera import perspective_cameras, perspective_views
 from ..subsets import every_nth
 from .initialization import focus_distance, points_on_rays
 from .training_views import pixel_bytes
@@ -51,8 +51,9 @@ class SceneFacts:
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     """Measure a scene with at least one training view; `seed` is that of the sampled points."""
     photos, views = scene.train_views, perspective_views(scene.train_views)
-    samples, ray_points = _sample_points(scene, views, seed)
-    visible, on_rays = (_in_view(views, points).sum(0) for points in (samples, ray_points))
+    cameras = [view.camera for view in views]
+    samples, ray_points = _sample_points(scene, cameras, seed)
+    visible, on_rays = (_in_view(cameras, points).sum(0) for points in (samples, ray_points))
     read_views = every_nth(views, MOST_VIEWS)
     figures = _photo_statistics(read_views)
     clipped, black, mean, square, _ = map(float, figures.mean(0))
@@ -83,23 +84,23 @@ def is_large(scene: Scene) -> bool:
 
     The figure is the mean fraction of the sampled points that a training photo contains, occlusion not considered.
     """
-    views = perspective_views(scene.train_views)
-    return float(_in_view(views, _sample_points(scene, views, 0)[0]).mean()) < LARGE_SCENE
+    cameras = perspective_cameras(scene.train_views)
+    return float(_in_view(cameras, _sample_points(scene, cameras, 0)[0]).mean()) < LARGE_SCENE
 
 
-def _sample_points(scene: Scene, views: tuple[View, ...], seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _sample_points(scene: Scene, cameras: Sequence[Camera], seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a sample [P, 3] of the sparse points, if there are enough, and points [Q, 3] along the cameras' rays."""
     rng = np.random.default_rng(seed)
-    samples = ray_points = points_on_rays(views, SAMPLES, focus_distance(views), rng)
+    samples = ray_points = points_on_rays(cameras, SAMPLES, focus_distance(cameras), rng)
     if len(scene.points) >= FEWEST_POINTS:
         count = min(SAMPLES, len(scene.points))
         samples = np.asarray(scene.points)[rng.choice(len(scene.points), count, replace=False)]
     return samples, ray_points
 
 
-def _in_view(views: Sequence[View], points: np.ndarray) -> np.ndarray:
-    """Return which views [V, P] contain which points [P, 3]."""
-    return np.array([view.camera.project(points).inside for view in views])
+def _in_view(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+    """Return which cameras [V, P] show which points [P, 3]."""
+    return np.array([camera.project(points).inside for camera in cameras])
 
 
 def _photo_statistics(views: Sequence[View]) -> np.ndarray:

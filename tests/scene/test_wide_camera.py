@@ -12,6 +12,7 @@ from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.types import View, codes_of
 from sehdr_warp.scene.wide_camera import (
     faces_of,
+    perspective_cameras,
     perspective_views,
     pixel_directions,
     pixels_of_directions,
@@ -79,6 +80,11 @@ def test_solid_angles_add_up_to_the_sphere():
 def test_cut_views_show_the_same_directions(camera, count):
     faces = faces_of(colored(camera))
     assert len(faces) >= count and all(face.camera.is_pinhole for face in faces)
+    cameras = perspective_cameras([colored(camera)])
+    assert len(cameras) == len(faces) and all(coarse.width == 64 for coarse in cameras)
+    for coarse, face in zip(cameras, faces, strict=True):
+        np.testing.assert_allclose(coarse.resized(*face.image.shape[1::-1]).intrinsics, face.camera.intrinsics)
+        np.testing.assert_array_equal(coarse.world_to_camera, face.camera.world_to_camera)
     for face in faces:
         along = pixel_directions(face.camera) @ face.camera.world_to_camera[:3, :3]
         inside = np.ones(along.shape[:2], bool) if face.mask is None else face.mask > 0.99
