@@ -304,7 +304,7 @@ def _pixels(scene: Scene, max_size: int | None) -> float:
             factor = (min(longest, max_size or longest) / LARGEST_SIDE) ** 2
         except OSError:
             pass  # RAW and float photos: as many as the reduced ones.
-    return factor * sum(each.camera.width * each.camera.height for each in scene.train_views)
+    return factor * sum(each.camera.pixel_count for each in scene.train_views)
 
 
 def _photo_bytes(views: Sequence[View]) -> dict[str, int]:
@@ -316,7 +316,7 @@ def _photo_bytes(views: Sequence[View]) -> dict[str, int]:
 def _blocks(scene: Scene, division: Division, points: np.ndarray) -> tuple[Block, ...]:
     """Return the blocks of a division; a held-out view belongs to the block that it shows most of."""
     views = scene.train_views
-    sizes = np.array([view.camera.width * view.camera.height for view in views], np.float64)
+    sizes = np.array([view.camera.pixel_count for view in views], np.float64)
     names: list[list[str]] = [[views[index].name for index in own] for own in division.photos]
     points = thin_out(points, len(views))
     owner = division.block_of(points)

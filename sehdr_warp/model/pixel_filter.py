@@ -61,7 +61,7 @@ def samples_across_pixel(field: Any, camera: Camera) -> int:
     if field.photo_focals is None or field.antialiased or not camera.is_pinhole:
         return 1
     resolves_photos = math.ceil(field.photo_focals.least / camera.fx - TOLERANCE)
-    return max(1, min(resolves_photos, math.isqrt(MOST_PIXELS // (camera.width * camera.height))))
+    return max(1, min(resolves_photos, math.isqrt(MOST_PIXELS // camera.pixel_count)))
 
 
 def photo_filters(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -293,7 +293,7 @@ def confidence_metadata(checkpoint_hash: str) -> dict[str, str | int]:
 
 def _camera_entry(view: dict, source: Path) -> CameraEntry:
     camera = Camera.from_dict(view["camera"])
-    if camera.width * camera.height > MAX_PIXELS:
+    if camera.pixel_count > MAX_PIXELS:
         raise ValueError(f"{camera.width} x {camera.height} is more than {MAX_PIXELS} pixels")
     placed, time = None, float(view["exposure_time"])
     if values := view.get("lens"):

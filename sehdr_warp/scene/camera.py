@@ -125,6 +125,11 @@ class Camera:
         return f"Camera({self.width} x {self.height}, focal length {self.fx:.5g} pixels, at ({position}){kind})"
 
     @property
+    def pixel_count(self) -> int:
+        """Number of pixels of the image."""
+        return self.width * self.height
+
+    @property
     def is_pinhole(self) -> bool:
         """True if pixels are on a plane in front of the camera."""
         return self.projection == "pinhole"

@@ -219,7 +219,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
         steps=trainer.total if "schedule.iterations" in trainer.config.plan.keep else None,
         posed=posed,
         misfit=any(MISFIT in note for note in scene.notes),
-        sizes={view.name: view.camera.width * view.camera.height for view in scene.train_views},
+        sizes={view.name: view.camera.pixel_count for view in scene.train_views},
         uncertain={view.name for view in scene.train_views if view.uncertain},
     )
     return training.advice()

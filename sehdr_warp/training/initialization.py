@@ -160,7 +160,7 @@ def start_points(
         [N, 3] points and their encoded colors [N, 3].
     """
     points, colors = scene.points, scene.point_colors
-    number = start_count(config, sum(view.camera.width * view.camera.height for view in scene.train_views))
+    number = start_count(config, sum(view.camera.pixel_count for view in scene.train_views))
     if number > len(points):
         matches = _match_points(get_matcher(), number - len(points), config.seed)
         points, colors = (np.concatenate(both) for both in zip((points, colors), matches, strict=True))

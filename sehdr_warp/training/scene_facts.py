@@ -61,7 +61,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     dark_views = every_nth([view for view in views if view.exposure_time <= longest], MOST_VIEWS)
     return SceneFacts(
         photos=len(photos),
-        pixels=sum(view.camera.width * view.camera.height for view in photos),
+        pixels=sum(view.camera.pixel_count for view in photos),
         from_camera=are_camera_jpegs([view.source for view in photos]),
         truths=sum(view.hdr is not None for view in photos),
         points=len(scene.points),
@@ -121,7 +121,7 @@ def _photo_statistics(views: Sequence[View]) -> np.ndarray:
 
 def _sampled(view: View) -> np.ndarray:
     """Return the encoded values [N, 3] of a photo inside its mask, sampled on a grid if it has over MOST_PIXELS."""
-    step = max(1, round((view.camera.width * view.camera.height / MOST_PIXELS) ** 0.5))
+    step = max(1, round((view.camera.pixel_count / MOST_PIXELS) ** 0.5))
     values = encoded_values(view.codes[::step, ::step])
     return values.reshape(-1, 3) if view.mask is None else values[view.mask[::step, ::step] > 0.5]
 

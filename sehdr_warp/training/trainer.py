@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache, partial
+from operator import attrgetter
 
 import torch
 from torch import Tensor
@@ -113,7 +114,7 @@ class Trainer:
         normalized = field.normalization.scene(scene)
         views = normalized.train_views
         self.optimizer = make_optimizer(field, config, self.batch)
-        pixels = sum(view.camera.width * view.camera.height for view in views)
+        pixels = sum(view.camera.pixel_count for view in views)
         self.large_scene = is_large(scene) if large_scene is None else large_scene
         points = normalized.points[:0] if self.large_scene else normalized.points
         self.nearest_points = distances_of_points(views, points) if nearest_points is None else nearest_points
@@ -388,5 +389,5 @@ class Trainer:
 
 def sizes_of(scene: Scene, gaussians: int | None = None) -> tuple[int, int, int]:
     """Return the number of Gaussians, by default that of the points, and width and height of the largest photo."""
-    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
+    camera = max((view.camera for view in scene.views), key=attrgetter("pixel_count"))
     return len(scene.points) if gaussians is None else gaussians, camera.width, camera.height

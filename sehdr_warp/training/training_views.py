@@ -154,4 +154,4 @@ class ViewDataset(Sequence[TrainingView]):
     def bytes(self) -> int:
         """Memory that all views would take on the device."""
         each, truth = pixel_bytes(self.views), 12 * self.truth
-        return sum(v.camera.width * v.camera.height * (each + truth * (v.hdr is not None)) for v in self.views)
+        return sum(v.camera.pixel_count * (each + truth * (v.hdr is not None)) for v in self.views)

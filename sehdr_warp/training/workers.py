@@ -49,7 +49,7 @@ def several_ranks_notes(trainer: Trainer) -> Iterator[str]:
     if trainer.ranks is None:
         return
     views, most = trainer.scene.train_views, max(trainer.field.gaussians.count, trainer.strategy.cap_max)
-    pixels = sum(view.camera.width * view.camera.height for view in views) // len(views)
+    pixels = sum(view.camera.pixel_count for view in views) // len(views)
     yield gain_of_ranks(trainer.ranks.count, most, pixels, trainer.total, trainer.device)
     yield from trainer.ranks.notes()
 

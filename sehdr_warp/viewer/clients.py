@@ -47,12 +47,12 @@ class ClientRun:
         samples = getattr(self._run, "samples_across_pixel", None) if supersample else None  # A training has none.
         factor = 1 if samples is None else samples(camera)
         render = partial(self._run.render, camera, supersample=supersample)
-        return self._on_renderer(self._client, render, factor**2 * camera.width * camera.height)
+        return self._on_renderer(self._client, render, factor**2 * camera.pixel_count)
 
     def render_confidence(self, camera: Any) -> Any:
         """Render confidence."""
         render = partial(self._run.render_confidence, camera)
-        return self._on_renderer(self._client, render, camera.width * camera.height)
+        return self._on_renderer(self._client, render, camera.pixel_count)
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the run."""

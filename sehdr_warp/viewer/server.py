@@ -110,7 +110,7 @@ class Viewer:
         options = {name: bool(request.get(name)) for name in ("draft", "clipped")}
         run, camera = self._run_of(request), camera_of(request["camera"])
         client.reserve(frame_bytes(camera, options["clipped"]))
-        parts, pixels, frame = run.frame_parts(camera, **options), camera.width * camera.height, None
+        parts, pixels, frame = run.frame_parts(camera, **options), camera.pixel_count, None
         while frame is None:
             frame = self.on_renderer(client, partial(next, parts), pixels)
         return "application/octet-stream", frame
@@ -201,7 +201,7 @@ class Viewer:
             raise Refusal(400, f"stops {stops} are not between -{MOST_STOPS:g} and {MOST_STOPS:g}")
         evs = str(request.get("evs") or "-4,-2,0,2,4") if kind == "brackets" else None
         pictures = len(evs.split(",")) + 1 if evs else 1
-        pixels = pictures * sum(camera.width * camera.height for camera in cameras)
+        pixels = pictures * sum(camera.pixel_count for camera in cameras)
         if kind != "film" and pixels > MOST_SAVED:
             raise Refusal(413, f"{pixels} pixels are more than the {MOST_SAVED} of a save; use sehdr-warp render")
         if not self._save_lock.acquire(blocking=False):

@@ -220,14 +220,14 @@ def camera_of(values: dict) -> Camera:
     Raises ValueError for a bad value or too large a picture, KeyError for a missing field, TypeError for a wrong one.
     """
     camera = Camera.from_dict(values)
-    if camera.width * camera.height > MOST_PIXELS:
+    if camera.pixel_count > MOST_PIXELS:
         raise ValueError(f"{camera.width} x {camera.height} is more than {MOST_PIXELS} pixels")
     return camera
 
 
 def frame_bytes(camera: Camera, clipped: bool) -> int:
     """Return the size of a frame in bytes; see ViewerScene.frame_parts."""
-    return 2 * (6 if clipped else 5) * camera.width * camera.height
+    return 2 * (6 if clipped else 5) * camera.pixel_count
 
 
 def camera_file(run: Any, cameras: Sequence[Camera]) -> str:

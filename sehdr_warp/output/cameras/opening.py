@@ -164,4 +164,4 @@ def _visible_share(run: "RenderableScene", camera: Camera, witnesses: Sequence[C
     if not len(points):
         return 0.0
     counts = np.sum([witness.project(points).inside for witness in witnesses], axis=0)
-    return float((counts >= min(_SEVERAL, len(witnesses))).sum() / (camera.width * camera.height))
+    return float((counts >= min(_SEVERAL, len(witnesses))).sum() / camera.pixel_count)

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -94,7 +95,7 @@ def _views(figures: Sequence[Markup]) -> Markup:
 def _header(run: "Run", scene: Scene, picture: Markup) -> Markup:
     """Return title, first picture and figures of the training."""
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
-    camera = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
+    camera = max((view.camera for view in scene.views), key=attrgetter("pixel_count"))
     times = sorted({view.exposure_time for view in scene.train_views or scene.views})
     span = " to ".join(shutter(time) for time in sorted({times[0], times[-1]})).replace(" s to", " to")
     exposure = "exposure" if run.exposure_compensation is None else "exposure, compensated"

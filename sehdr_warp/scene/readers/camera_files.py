@@ -68,7 +68,7 @@ def read_camera_file(path: Path) -> ExchangeCameras:
     for i, (name, camera) in enumerate(cameras):
         if not name or any(letter in name for letter in "/\\\0") or name in (".", "..") or len(name) > 200:
             raise InputError(path, f"camera name {name!r:.60} cannot name a file", "use letters, digits, '_' and '-'")
-        if camera.width * camera.height > MAX_PIXELS:
+        if camera.pixel_count > MAX_PIXELS:
             size = f"{camera.width} x {camera.height}"
             raise InputError(path, f"camera {i} is {size}", f"use sizes of 1 to {MAX_PIXELS} pixels")
     return file
