@@ -165,6 +165,8 @@ class _Resampler:
 
 
 class _Preprocessor:
+    """Makes the views of a set's photos, on several threads, and collects what the scene's notes say of them."""
+
     def __init__(self, max_size: int | None, response: "Response", alpha: str, to_rec709: np.ndarray | None):
         self.max_size, self.response, self.alpha, self.to_rec709 = max_size, response, alpha, to_rec709
         self._tables: dict[int, np.ndarray] = {}
@@ -214,7 +216,7 @@ class _Preprocessor:
             self.transparent.add(name)
             if self.alpha == "mask":
                 masks.append(resample(photo.alpha))
-        photo = self._resampled(
+        photo = self._at_view_size(
             photo, encoding, resample, resized=(camera.width, camera.height) != (lens.width, lens.height)
         )
         if self.to_rec709 is not None:
@@ -222,10 +224,21 @@ class _Preprocessor:
                 photo = replace(photo, pixels=codes_in_rec709(photo.pixels, self.response, self.to_rec709))
         mask = np.clip(np.prod(masks, axis=0), 0, 1).astype(np.float32) if masks else None
         mask = _by_solid_angle(None if mask is None or mask.min() >= 1 - 1e-6 else mask, camera)
-        above = {"light_above_white": photo.above_white, "light_above_white_deviation": photo.above_white_deviation}
-        turned = 1 if oriented else stored_orientation(record.image)
-        facts = {"lens": record.lens, "orientation": turned, "uncertain": record.uncertain}
-        return View(name, photo.pixels, camera, time, split, mask, hdr, record.image, **above, **facts)
+        return View(
+            name,
+            photo.pixels,
+            camera,
+            time,
+            split,
+            mask,
+            hdr,
+            record.image,
+            light_above_white=photo.above_white,
+            light_above_white_deviation=photo.above_white_deviation,
+            lens=record.lens,
+            orientation=1 if oriented else stored_orientation(record.image),
+            uncertain=record.uncertain,
+        )
 
     def _truth(self, record: ImageRecord, lens: Lens, resample: _Resampler) -> np.ndarray | None:
         """Return the truth of a photo at the size of its view; None without a file, or with one that cannot be used."""
@@ -255,17 +268,17 @@ class _Preprocessor:
             self.cropped[record.image] = undistortion.share
         return _Resampler(lens, undistortion, undistortion.camera(record.world_to_camera).within(self.max_size))
 
-    def _resampled(
+    def _at_view_size(
         self, photo: EncodedImage, encoding: ColorEncoding, resample: _Resampler, *, resized: bool
     ) -> EncodedImage:
         """Return a photo in sRGB's colors at the size of its view; its transparency is that of masks, or blended in."""
         alpha = None if self.alpha == "mask" else photo.alpha
-        averaged = resample.undistortion is not None or resized or alpha is not None
+        averages = resample.undistortion is not None or resized or alpha is not None
         to_shared = getattr(self.response, "to_shared", None)  # Of a response whose channels differ
-        if to_shared is not None or not averaged:
+        if to_shared is not None or not averages:
             photo, encoding = encoding.convert(photo), ColorEncoding("sRGB")
         photo = photo if to_shared is None else replace(photo, pixels=to_shared(photo.pixels))
-        return self._average(replace(photo, alpha=alpha), encoding, resample) if averaged else photo
+        return self._average(replace(photo, alpha=alpha), encoding, resample) if averages else photo
 
     def _average(self, photo: EncodedImage, encoding: ColorEncoding, resample: _Resampler) -> EncodedImage:
         """Return the codes of the mean light, and the light above white that is left in it.
@@ -278,13 +291,13 @@ class _Preprocessor:
                 light = self.response.decode(np.arange(levels + 1, dtype=np.float64) / levels)
                 self._tables[levels] = np.maximum(light, 0.0).astype(np.float32)
             if not encoding.is_srgb and self._light_of_srgb is None:
-                self._light_of_srgb = FloatTable(self._decoded_srgb)
+                self._light_of_srgb = FloatTable(self._decode_srgb)
         white = self._tables[levels][levels]
 
         def weighted(values: np.ndarray | None, rows: slice) -> np.ndarray | None:
             return values if alpha is None or values is None else values * alpha[rows, :, None]
 
-        def converted(rows: slice) -> np.ndarray:
+        def light_by_encoding(rows: slice) -> np.ndarray:
             assert self._light_of_srgb is not None
             light, clipped = encoding.to_linear(codes[rows], None if above is None else above[rows])
             if clipped.any():
@@ -293,7 +306,7 @@ class _Preprocessor:
 
         def light_of(rows: slice) -> np.ndarray:
             if not encoding.is_srgb:
-                return np.concatenate([converted(band) for band in bands_of(rows, codes.shape[1])])
+                return np.concatenate([light_by_encoding(band) for band in bands_of(rows, codes.shape[1])])
             light = self._tables[levels][codes[rows]]
             return light if above is None else np.where(above[rows] > 0, above[rows] * white, light)
 
@@ -315,7 +328,7 @@ class _Preprocessor:
         deviation = photo.above_white_deviation if encoding.is_srgb else max(DEVIATION, photo.above_white_deviation)
         return EncodedImage(averaged, None, brighter, 0.0 if brighter is None else deviation)
 
-    def _decoded_srgb(self, light: np.ndarray) -> np.ndarray:
+    def _decode_srgb(self, light: np.ndarray) -> np.ndarray:
         """Return what the response decodes codes of sRGB to, by their linear light, 1 at white."""
         decoded = np.maximum(self.response.decode(linear_to_srgb(np.minimum(light, 1))), 0)
         return np.where(light > 1, light * float(self.response.decode(np.ones(1))[0]), decoded)
