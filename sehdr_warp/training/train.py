@@ -32,7 +32,7 @@ from .ranks import Ranks
 from .run_output import RunOutput
 from .seeding import brighten_clipped
 from .trainer import Trainer, sizes_of
-from .training_state import load_state, scene_facts_of, state_of
+from .training_state import load_state, point_facts_of, state_of
 from .workers import send_training, several_ranks_notes
 
 log = logging.getLogger(__name__)
@@ -195,7 +195,7 @@ def _resumed_trainer(
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
     longer = config.continued_after(finished_at)
-    facts = scene_facts_of(checkpoint)
+    facts = point_facts_of(checkpoint)
     if (distances := facts["nearest_points"]) is not None and len(distances) != len(scene.train_views):
         problem = f"nearest_points has {len(distances)} values, and {len(scene.train_views)} photos are trained on"
         raise InputError(checkpoint.path, problem, "remove it, or train again")

@@ -13,7 +13,7 @@ from .optimizer import load_optimizer_tensors, optimizer_tensors
 if TYPE_CHECKING:
     from .trainer import Trainer
 
-_SCENE_FACTS = "large_scene", "nearest_points", "median_depth"  # Of points that a training that goes on may lack
+_POINT_FACTS = "large_scene", "nearest_points", "median_depth"  # Of points that a training that goes on may lack
 
 
 def state_of(trainer: Trainer) -> Checkpoint:
@@ -32,13 +32,13 @@ def state_of(trainer: Trainer) -> Checkpoint:
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
     values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining}
     values |= {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
-    values |= {name: getattr(trainer, name) for name in _SCENE_FACTS}
+    values |= {name: getattr(trainer, name) for name in _POINT_FACTS}
     return Checkpoint(tensors, values)
 
 
-def scene_facts_of(state: Checkpoint) -> dict[str, Any]:
+def point_facts_of(state: Checkpoint) -> dict[str, Any]:
     """Return arguments of Trainer() for a training that continues from a state; of an earlier version some are None."""
-    return {name: state.values.get(name) for name in _SCENE_FACTS}
+    return {name: state.values.get(name) for name in _POINT_FACTS}
 
 
 def load_state(trainer: Trainer, state: Checkpoint) -> None:

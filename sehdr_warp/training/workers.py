@@ -18,7 +18,7 @@ from ..scene.normalization import Normalization
 from .cost import gain_of_ranks
 from .ranks import Ranks
 from .trainer import Trainer
-from .training_state import load_state, scene_facts_of, state_of
+from .training_state import load_state, point_facts_of, state_of
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
         ranks.share_photos(scene, _bytes_of(scene))
     else:
         scene = ranks.receive_photos()
-    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks, **scene_facts_of(checkpoint))
+    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks, **point_facts_of(checkpoint))
     load_state(trainer, checkpoint)
     del message, checkpoint, tensors
     for _ in trainer:
