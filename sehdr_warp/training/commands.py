@@ -4,8 +4,8 @@ import json
 import logging
 import os
 import shlex
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from ..runs.run import Run
     from .launch import RankInfo
     from .ranks import Ranks
+    from .trainer import Trainer
+    from .training_progress import TrainingProgress
 
 log = logging.getLogger(__name__)
 
@@ -179,7 +181,6 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
     from ..console import run_with_progress
     from ..response import Response
     from ..runs.run_writer import RunWriter
-    from ..viewer.live import serve_training
     from .advice import advice_on, options_of_run
     from .hdr_truth import check_dataset_truth
     from .process_settings import precompiling
@@ -210,13 +211,19 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
         trainer = create_trainer(request.load(), out, config, device=device, data=data, ranks=ranks, **flags)
         if trainer.iteration >= trainer.total:
             log.info("all %d iterations are done: nothing is left to train", trainer.total)
-        with serve_training(trainer, str(out)) if output.view else nullcontext(trainer) as steps:
-            # Iterating the trainer trains; serve_training() answers browsers between its steps.
-            run_with_progress(steps, trainer.total)
+        with _serve(trainer, out) if output.view else nullcontext(trainer) as steps:
+            run_with_progress(steps, trainer.total)  # Iterating the trainer trains.
     options = {"response": args.scene.response, "preset": args.training.preset, "seed": args.training.seed}
     command_options = options_of_run(trainer.run) if output.resume else used_fields(args.fields) | options
     command_options |= {"device": args.machine.device, "gpus": args.machine.gpus if args.machine.gpus > 1 else None}
     _print_result(args, trainer.run, advice_on(trainer, data, command_options))
+
+
+def _serve(trainer: "Trainer", out: Path) -> "AbstractContextManager[Iterable[TrainingProgress]]":
+    """Serve the page of --view; iterating the result trains, and answers browsers between steps."""
+    from ..viewer.live import serve_training  # With its HTTP server, which other trainings do without.
+
+    return serve_training(trainer, str(out))
 
 
 def _print_plan(args: Train) -> None:
