@@ -106,19 +106,8 @@ def render_views(
         InputError: If a file would be replaced or a pixel is not finite.
     """
     refuse_paths("load_run", run)
-    check_options(
-        cameras,
-        size,
-        aovs=aovs,
-        evs=evs,
-        exposures=exposures,
-        pixel=pixel,
-        multipart=multipart,
-        ldr_brackets=ldr_brackets,
-        group_by=group_by,
-        ocio=ocio,
-        view=view,
-    )
+    options = {"multipart": multipart, "ldr_brackets": ldr_brackets, "group_by": group_by, "ocio": ocio, "view": view}
+    check_options(cameras, size, aovs=aovs, evs=evs, exposures=exposures, pixel=pixel, **options)
     out, aov_names = Path(out), read_aovs(aovs)
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, size=size, transform=transform, up=up)
