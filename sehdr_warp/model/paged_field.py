@@ -7,7 +7,7 @@ LEVEL_STEP neighboring Gaussians become one, with their mean and covariance.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..scene import Camera
 from .gaussians import PARAMETER_NAMES, Gaussians
-from .radiance_field import RadianceField, require_camera
+from .radiance_field import NO_DATA, RadianceField, require_camera
 from .renders import DirectionalRender, RenderedView
 
 CELL = 1 << 16  # Gaussians of a cell
@@ -92,9 +92,13 @@ class PagedField(RadianceField):
             )
         return [(int(cell), int(place >= number)) for place, cell in enumerate(cells)]
 
-    def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
+    def render(
+        self, camera: Camera, *, degree: int | None = None, data: Mapping[str, Tensor] = NO_DATA
+    ) -> RenderedView:
         """Render the HDR view of a camera, as RadianceField.render."""
-        return self._part(self._levels_of(camera)).render(camera, degree=degree)
+        levels = self._levels_of(camera)
+        parts = {name: self._of_rows(values, levels) for name, values in data.items()}
+        return self._part(levels).render(camera, degree=degree, data=parts)
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
         """Render a simulated photo, as RadianceField.render_ldr."""
@@ -103,8 +107,7 @@ class PagedField(RadianceField):
     def render_mean(self, camera: Camera, values: Tensor) -> Tensor:
         """Render the mean of values [N], as RadianceField.render_mean."""
         levels = self._levels_of(camera)
-        part, rows = self._part(levels), self._rows(levels)
-        return part.render_mean(camera, values.cpu()[rows].to(self.render_device))
+        return self._part(levels).render_mean(camera, self._of_rows(values, levels))
 
     def render_directions(
         self, position: np.ndarray, directions: Tensor, *, without: Sequence[Tensor] = (), **options: Any
@@ -114,10 +117,10 @@ class PagedField(RadianceField):
             raise SehdrError("lights of a scene that does not fit into the GPU cannot be left out; use --device cpu")
         levels = self.levels(None, position)
         if options.get("shares") is not None:
-            options["shares"] = options["shares"].cpu()[self._rows(levels)].to(self.render_device)
+            options["shares"] = self._of_rows(options["shares"], levels)
         part = self._part(levels)
         if self.confidence is not None:  # Gathered here alone: other pictures of millions of Gaussians do not need it.
-            part.confidence = self.confidence.cpu()[self._rows(levels)].to(self.render_device)
+            part.confidence = self._of_rows(self.confidence, levels)
         return part.render_directions(position, directions, **options)
 
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
@@ -162,6 +165,10 @@ class PagedField(RadianceField):
             self._pages[key] = {name: tensor.to(self.render_device) for name, tensor in page.items()}
         self._pages.move_to_end(key)
         return self._pages[key]
+
+    def _of_rows(self, values: Tensor, levels: list[tuple[int, int]]) -> Tensor:
+        """Return values [N] of the Gaussians of some cells, on the device."""
+        return values.cpu()[self._rows(levels)].to(self.render_device)
 
     def _rows(self, levels: list[tuple[int, int]]) -> Tensor:
         """Return the indices of the rows of some cells, of the first of each group at a lower level."""

@@ -1,10 +1,11 @@
 """The radiance field: Gaussians rendered as base exposure, fused HDR exposure and encoded values.
 
 Every color set that a training step needs is a group of three channels of one rasterization, so that geometry is
-projected, sorted and blended once. Confidence and shares of a picture are rasterizations of their own.
+projected, sorted and blended once.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from .gaussians import Gaussians
 from .pixel_filter import EPS2D, FocalRange, keep_light
 from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView
 
+NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
 _PIXELS_AT_ONCE = 1 << 19  # Of which colors are decoded
 
 
@@ -162,10 +164,13 @@ class RadianceField(nn.Module):
 
     @torch.no_grad()
     @without_replays()  # Views differ in size, and each graph would fit one size.
-    def render(self, camera: Camera, *, degree: int | None = None) -> RenderedView:
+    def render(
+        self, camera: Camera, *, degree: int | None = None, data: Mapping[str, Tensor] = NO_DATA
+    ) -> RenderedView:
         """Render the HDR view of a camera, with depth as a fourth channel of the same rasterization.
 
-        The depth of a camera that is not a pinhole is the distance from it.
+        The depth of a camera that is not a pinhole is the distance from it. Data are further channels: values [N] by
+        attributes of the result, which are what render_mean() returns.
         """
         tensors = self.camera_tensors(camera)
         pose = tensors.world_to_camera
@@ -173,14 +178,18 @@ class RadianceField(nn.Module):
             depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         else:
             depth = (self.gaussians.means - tensors.position).norm(dim=1, keepdim=True)
-        rendering = self._rasterize(tensors, torch.cat([self._blended_colors(tensors.position, degree), depth], dim=1))
-        depth = _unpremultiply(rendering.image[..., 3], rendering.alpha).mul_(self.normalization.unit)
+        values = [value[:, None] for value in data.values()]
+        colors = self._blended_colors(tensors.position, degree)
+        rendering = self._rasterize(tensors, torch.cat([colors, depth, *values], dim=1))
+        alpha = rendering.alpha
+        depth, *means = (_unpremultiply(channel, alpha) for channel in rendering.image[..., 3:].unbind(-1))
         # In bands, because decoding takes many times the memory of what it decodes.
         image, rows = rendering.image, max(1, _PIXELS_AT_ONCE // camera.width)
         hdr = image.new_empty(*image.shape[:2], 3)
         for colors, band in zip(image[..., :3].split(rows), hdr.split(rows)):
             torch.div(self._to_exposures(colors), self.base_time, out=band)
-        return RenderedView(hdr, rendering.alpha, depth)
+        means = [mean.clamp_(0, 1) for mean in means]
+        return RenderedView(hdr, alpha, depth.mul_(self.normalization.unit), **dict(zip(data, means, strict=True)))
 
     @torch.no_grad()
     def render_directions(

@@ -42,11 +42,15 @@ class RenderedView:
         hdr: [H, W, 3] float32 scene-linear radiance, >= 0, not multiplied by an exposure time.
         alpha: [H, W] coverage in [0, 1].
         depth: [H, W] mean distance along the camera's axis if alpha is above 0.001, else 0; scene units.
+        confidence: [H, W] in [0, 1] as in DirectionalRender; None if it was not measured or not asked for.
+        clipped: [H, W] in [0, 1], as from render_clipped; None if it was not measured or not asked for.
     """
 
     hdr: Tensor
     alpha: Tensor
     depth: Tensor
+    confidence: Tensor | None = None
+    clipped: Tensor | None = None
 
     def reduced(self, factor: int) -> "RenderedView":
         """Return the view at a size that is smaller by an integer factor: the mean of each factor x factor pixels."""

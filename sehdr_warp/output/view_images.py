@@ -38,8 +38,8 @@ def render_images(
 
     Raises SehdrError if one of the AOVs was not measured for the run.
     """
-    rendered, confidence = run.render(camera), run.render_confidence(camera)
-    clipped = run.render_clipped(camera) if "clipped" in aovs else None
+    rendered = run.render(camera, data=("confidence", "clipped") if "clipped" in aovs else ("confidence",))
+    confidence, clipped = rendered.confidence, rendered.clipped
     for name, values in (("confidence", confidence), ("clipped", clipped)):
         if values is None and name in aovs:
             remedy = "`sehdr-warp report` measures it for a run, from the photos; else leave the AOV out"

@@ -1,6 +1,7 @@
 """A trained scene, loaded from its run folder or from a file of Gaussians."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -97,16 +98,24 @@ class RenderableScene:
         """Number of Gaussians."""
         return self.field.gaussians.count
 
-    def render(self, camera: Camera, *, supersample: bool = True) -> RenderedView:
+    def render(self, camera: Camera, *, supersample: bool = True, data: Sequence[str] = ()) -> RenderedView:
         """Render HDR radiance [H, W, 3], alpha [H, W] and depth [H, W] from a camera.
 
         With `supersample`, a pinhole view coarser than the photos is rendered as finely as they are and averaged.
         Without it, which is faster, lamps smaller than a pixel get 0.7 to 1.6 times their light, and edges are rough.
+
+        `data` are names of further attributes, "confidence" and "clipped": images that render_confidence() and
+        render_clipped() return, here in the same rasterization unless a finer one is averaged.
         """
         factor = self.samples_across_pixel(camera) if supersample else 1
         finer = camera.resized(factor * camera.width, factor * camera.height)
-        view = self.field.render(finer, degree=self.degree)
-        return replace(view, hdr=self.in_rec709(view.hdr)).reduced(factor)
+        sources = {"confidence": lambda: self.field.confidence, "clipped": self.clipped_share}
+        values = {name: share for name in data if (share := sources[name]()) is not None}
+        view = self.field.render(finer, degree=self.degree, data=values if factor == 1 else {})
+        view = replace(view, hdr=self.in_rec709(view.hdr)).reduced(factor)
+        if factor > 1:
+            view = replace(view, **{name: self.field.render_mean(camera, share) for name, share in values.items()})
+        return view
 
     def samples_across_pixel(self, camera: Camera) -> int:
         """Return how many times finer than a camera's pixels render() renders what it averages; at least 1."""

@@ -42,17 +42,12 @@ class ClientRun:
         """Set the run, and what calls a function on the renderer, see Viewer.on_renderer."""
         self._on_renderer, self._run, self._client = on_renderer, run, client
 
-    def render(self, camera: Any, *, supersample: bool = True) -> Any:
+    def render(self, camera: Any, *, supersample: bool = True, **options: Any) -> Any:
         """Render a camera, as RenderableScene.render(); its turn comes by the pixels that are averaged."""
         samples = getattr(self._run, "samples_across_pixel", None) if supersample else None  # A training has none.
         factor = 1 if samples is None else samples(camera)
-        render = partial(self._run.render, camera, supersample=supersample)
+        render = partial(self._run.render, camera, supersample=supersample, **options)
         return self._on_renderer(self._client, render, factor**2 * camera.pixel_count)
-
-    def render_confidence(self, camera: Any) -> Any:
-        """Render confidence."""
-        render = partial(self._run.render_confidence, camera)
-        return self._on_renderer(self._client, render, camera.pixel_count)
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the run."""

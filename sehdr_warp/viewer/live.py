@@ -55,7 +55,7 @@ class LiveTraining(ViewerScene):
             raise AttributeError(name)
         return attributes[name]
 
-    def render(self, camera: Camera, **options: bool):
+    def render(self, camera: Camera, **options: Any):
         """Render between two steps; options change nothing, because a scene under training is never averaged."""
         return self._between_steps(lambda: self.run.render(camera))
 

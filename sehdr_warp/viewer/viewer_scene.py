@@ -137,7 +137,7 @@ class ViewerScene:
         """True if pictures are made on the CPU."""
         return str(getattr(self.run, "device", "cpu")) == "cpu"
 
-    def render(self, camera: Camera, **options: bool):
+    def render(self, camera: Camera, **options: Any):
         """Render a camera, with options of RenderableScene.render(), while no other thread changes the scene."""
         with self.lock.rendering():
             return self.run.render(camera, **options)

@@ -1,6 +1,7 @@
 """Confidence: what a photo leaves in doubt, and what gathers on the Gaussians that are seen in it."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene import Camera, View, codes_of
 
 SRGB = response_by_name("srgb")
@@ -149,3 +151,22 @@ def test_estimates_of_views_reach_the_confidence_of_what_they_show():
     )
     assert low - high == pytest.approx((1 / 0.8 - 1 / 8) / np.log(2), rel=1e-2)
     assert none == gather_evidence(model, [white_view]).stops[0]
+
+
+@pytest.mark.parametrize("finer", [1, 2])
+def test_a_picture_and_its_data_are_one_rasterization_of_the_same_bits(device, finer, monkeypatch):
+    model, share = field(device), torch.tensor([0.1, 0.6, 0.3], device=device)
+    model.confidence = torch.tensor([0.9, 0.2, 1.0], device=device)
+    scene = Splats(Path("scene.ply"), model, ())
+    monkeypatch.setattr(scene, "clipped_share", lambda: share)
+    monkeypatch.setattr(scene, "samples_across_pixel", lambda camera: finer)
+    whole, calls = scene.render(CAMERA), []
+    monkeypatch.setattr(model, "rasterizer", lambda *args, **options: calls.append(1) or rasterize(*args, **options))
+    view = scene.render(CAMERA, data=("confidence", "clipped"))
+    assert len(calls) == (1 if finer == 1 else 3)
+    assert all(torch.equal(getattr(view, name), getattr(whole, name)) for name in ("hdr", "alpha", "depth"))
+    assert torch.equal(view.confidence, scene.render_confidence(CAMERA))
+    assert torch.equal(view.clipped, scene.render_clipped(CAMERA))
+    assert whole.confidence is None and whole.clipped is None
+    model.confidence = None
+    assert scene.render(CAMERA, data=["confidence"]).confidence is None

@@ -59,6 +59,8 @@ def test_pictures_are_those_of_the_whole(street):
             assert torch.equal(getattr(whole, name), getattr(part, name)), name
         assert torch.equal(street.render_ldr(place, 0.2), paged.render_ldr(place, 0.2))
         assert torch.equal(street.render_confidence(place), paged.render_confidence(place))
+        part = paged.render(place, data={"confidence": paged.confidence})
+        assert torch.equal(part.hdr, whole.hdr) and torch.equal(part.confidence, paged.render_confidence(place))
     away = replace(place, world_to_camera=look_at((0, 0, 3), (0.1, 0, 9), up=(1.0, 0.0, 0.0)))
     assert paged.levels(away, away.position) == [] and not paged.render(away).alpha.any()
 

@@ -1,6 +1,6 @@
 """Pictures and cameras that the output tests share."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -91,7 +91,7 @@ class AnalyticRun:
     def clipped_share(self):
         return None
 
-    def render(self, view, *, supersample=True):
+    def render(self, view, *, supersample=True, data=()):
         self.rendered += 1
         y, x = np.mgrid[: view.height, : view.width] + 0.5
         rays = (
@@ -100,7 +100,8 @@ class AnalyticRun:
         )
         rays /= np.linalg.norm(rays, axis=2, keepdims=True)
         hdr = self.gain * np.exp(6 * rays - 2 * rays[..., :1]) * 0.1
-        return rendered_view(hdr, np.full(x.shape, 0.75), 2 + x * 0 + y * 1e-4)
+        rendered = rendered_view(hdr, np.full(x.shape, 0.75), 2 + x * 0 + y * 1e-4)
+        return replace(rendered, **{name: getattr(self, f"render_{name}")(view) for name in data})
 
 
 def read_exr(path):

@@ -85,10 +85,10 @@ class _Slow(AnalyticRun):
 
     renders = 0
 
-    def render(self, camera, *, supersample=True):
+    def render(self, camera, **options):
         self.renders += 1
         time.sleep(0.02)
-        return super().render(camera, supersample=supersample)
+        return super().render(camera, **options)
 
 
 def slow(server):
