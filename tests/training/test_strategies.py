@@ -11,7 +11,7 @@ from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.rasterizer.ops.relocation import relocation_sums
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.strategies import Seeds, make_strategy, mcmc
-from sehdr_warp.training.strategies.adc import sample_half
+from sehdr_warp.training.strategies.adc import split
 from sehdr_warp.training.strategies.mcmc import sample_rows
 
 
@@ -87,13 +87,13 @@ def test_small_are_cloned_and_large_are_split():
 
 
 def test_split_points_are_drawn_from_the_parent():
-    gaussians = cloud(4)
+    gaussians = cloud(20_000)
     scales = torch.tensor([0.5, 0.01, 0.2])
     quaternion = torch.tensor([0.3, -0.5, 0.7, 0.2])
-    gaussians.overwrite({"log_scales": scales.log().expand(4, 3), "quaternions": quaternion.expand(4, 4)})
-    parents = torch.zeros(20_000, dtype=torch.long)
-    rows = sample_half(gaussians, parents, torch.Generator().manual_seed(1))
-    offsets = rows["means"] - gaussians.means[0].detach()
+    gaussians.overwrite({"log_scales": scales.log().expand(20_000, 3), "quaternions": quaternion.expand(20_000, 4)})
+    half, other = split(gaussians, torch.ones(20_000, dtype=torch.bool), torch.Generator().manual_seed(1))
+    assert not torch.equal(half["means"], other["means"])
+    offsets = half["means"] - gaussians.means.detach()
     rotation = rotate(quaternion.expand(3, 4), torch.eye(3)).T
     expected = rotation @ torch.diag(scales**2) @ rotation.T
     torch.testing.assert_close(torch.cov(offsets.T), expected, atol=0.01, rtol=0.05)

@@ -1,6 +1,7 @@
 """Adaptive density control (3DGS): duplicate and split where image gradients are large, remove, reset opacities."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -56,10 +57,8 @@ class AdcStrategy(Strategy):
         if self.schedule.is_due(iteration, step_batch) and total is not None and count is not None:
             is_refinement = True
             small, large = self._select(gaussians, (total / count.clamp_min(1))[: gaussians.count])
-            parents = large.nonzero()[:, 0]
-            new_rows = [gaussians.rows(small.nonzero()[:, 0])]
-            new_rows += [sample_half(gaussians, parents, generator) for _ in range(2)]
-            new_rows = {name: torch.cat([rows[name] for rows in new_rows]) for name in PARAMETER_NAMES}
+            parts = [duplicate(gaussians, small), *split(gaussians, large, generator)]
+            new_rows = {name: torch.cat([rows[name] for rows in parts]) for name in PARAMETER_NAMES}
             self.remove(gaussians, optimizer, large, new_rows, oversized=iteration > self.reset_every)
             # In place, because captured steps add to these tensors.
             total.zero_()
@@ -94,7 +93,7 @@ class AdcStrategy(Strategy):
         self,
         gaussians: Gaussians,
         optimizer: Optimizer | None,
-        split: Tensor,
+        parents: Tensor,
         new_rows: dict[str, Tensor],
         *,
         oversized: bool,
@@ -104,7 +103,7 @@ class AdcStrategy(Strategy):
         Among the new ones, those that would be removed are not appended. If nothing would be left, only split ones are
         removed.
         """
-        remaining, rows = ~split, new_rows
+        remaining, rows = ~parents, new_rows
         good = remaining & self._is_good(gaussians.tensors(), oversized)
         index = self._is_good(new_rows, oversized).nonzero()[:, 0]
         if len(index) or bool(good.any()):
@@ -137,13 +136,20 @@ class AdcStrategy(Strategy):
         self.gradient_sum, self.photo_count = state.get("gradient_sum"), state.get("seen")
 
 
-def sample_half(gaussians: Gaussians, parents: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    """Return one smaller Gaussian for each parent index, at a point sampled from the parent."""
-    rows = gaussians.rows(parents)
-    normal = torch.randn(len(parents), 3, generator=generator, device=parents.device)
-    rows["means"] += rotate(rows["quaternions"], normal * rows["log_scales"].exp())
-    rows["log_scales"] -= math.log(SPLIT_SHRINK)
-    return rows
+def duplicate(gaussians: Gaussians, mask: Tensor) -> dict[str, Tensor]:
+    """Return copies of the Gaussians of a mask [N]."""
+    return gaussians.rows(mask.nonzero()[:, 0])
+
+
+def split(gaussians: Gaussians, mask: Tensor, generator: torch.Generator) -> Iterator[dict[str, Tensor]]:
+    """Yield twice a smaller Gaussian for each one of a mask [N], at a point sampled from it."""
+    parents = mask.nonzero()[:, 0]
+    for _ in range(2):
+        rows = gaussians.rows(parents)
+        normal = torch.randn(len(parents), 3, generator=generator, device=parents.device)
+        rows["means"] += rotate(rows["quaternions"], normal * rows["log_scales"].exp())
+        rows["log_scales"] -= math.log(SPLIT_SHRINK)
+        yield rows
 
 
 def _resize(values: Tensor | None, rows: int, device: torch.device | str) -> Tensor:

@@ -77,9 +77,7 @@ class McmcStrategy(Strategy):
         seed_count = self.place_seeds(refinement, dead_count, new_count, make_seeds)
         self.relocate(refinement, opacities.masked_fill(dead, 0), seed_count, dead_count, count)
         if new_count > 0:
-            first = torch.maximum(dead_count, seed_count)
-            weights = gaussians.opacities().masked_fill_(slot_of_row >= first, 0)
-            self.relocate(refinement, weights, first, dead_count + new_count, new_count)
+            self.sample_add(refinement, torch.maximum(dead_count, seed_count), dead_count + new_count, new_count)
         left = SECOND_MOMENT_LEFT_WHERE_DENSE if self.dense else SECOND_MOMENT_LEFT
         reset_moments(gaussians, optimizer, changed, left)
         return new_count > 0
@@ -130,6 +128,11 @@ class McmcStrategy(Strategy):
             changed = refinement.changed
         # Elsewhere, as in the authors' code, copies keep the Adam state of their row, and only their sources lose it.
         copy_rows(values, values, refinement.slot_of_row, first, last, samples=sampled, changed=changed)
+
+    def sample_add(self, refinement: Refinement, first: Tensor, last: Tensor, bound: int) -> None:
+        """Fill the slots [first, last) of new rows with copies of Gaussians sampled by opacity; as relocate()."""
+        weights = refinement.gaussians.opacities().masked_fill_(refinement.slot_of_row >= first, 0)
+        self.relocate(refinement, weights, first, last, bound)
 
     def inject_noise(self, iteration: int, gaussians: Gaussians, means_lr: float) -> None:
         """Add noise to positions, larger for transparent Gaussians.
