@@ -111,7 +111,7 @@ class BlockPlan:
         """Return the config of a block: its part of the budget of Gaussians.
 
         The budget is that of the requested mcmc.cap_density, 120 by default, on a GPU too. The plan of a training with
-        many photos doubles the default (training.plan.GPU_CAP_DENSITY) and leaves the smaller value of a block; only a
+        many photos raises the default to training.plan.GPU_CAP_DENSITY and leaves the smaller value of a block; only a
         block that has all photos is planned as one training.
         """
         root, fields = math.sqrt(block.fraction), {}

@@ -248,12 +248,12 @@ def test_a_cpu_short_of_time_gets_half_the_gaussians_unless_steps_are_asked_for(
         assert rule(case, config, device).fields == {}
 
 
-def test_a_gpu_gets_twice_the_gaussians_for_many_photos_of_one_place(facts):
+def test_a_gpu_gets_four_times_the_gaussians_for_many_photos_of_one_place(facts):
     many, rule = replace(facts, photos=21, visibility=9.0), RULES["densification"]
-    assert rule(many, config_of(), GPU).fields == {"mcmc.cap_density": 240.0}
+    assert rule(many, config_of(), GPU).fields == {"mcmc.cap_density": 480.0}
     few, survey = replace(many, photos=20), replace(many, visibility=2.0)
     rivals = rule(many, config_of(densification__strategy="adc"), GPU).fields
-    assert rivals == {"densification.cap_max": mcmc_cap(config_of(mcmc__cap_density=240.0), many.pixels)}
+    assert rivals == {"densification.cap_max": mcmc_cap(config_of(mcmc__cap_density=480.0), many.pixels)}
     others = {"mcmc__cap_density": 60.0}, {"plan__keep": ["mcmc.cap_density"]}
     cases = [(few, config_of(), GPU), (survey, config_of(), GPU), *((many, config_of(**each), GPU) for each in others)]
     for case, config, device in cases:
