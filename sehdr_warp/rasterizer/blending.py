@@ -18,6 +18,7 @@ from ..kernels.constants import TILE_SIZE
 from ..parallel import thread_count
 from .blending_cuda import blend_on_cuda
 from .gradients import sum_by_gaussian
+from .memory import check_room
 from .projection import Splats2D
 from .tile_lists import PackedSplats, TileLists
 from .torch_contract import direct_apply, keeps_graph, once_differentiable
@@ -48,11 +49,13 @@ def blend(
     deterministic: on a GPU, sum gradients in a fixed order, as the CPU always does.
     """
     features, channels = splats.features, splats.features.shape[1]
+    on_gpu = features.device.type == "cuda"
+    if not on_gpu:  # Of each pixel the channels, twice, and three further numbers are written.
+        check_room(lists.height * lists.width * (2 * channels + 3) * features.element_size())
     image = features.new_empty(lists.height, lists.width, channels)
     transmittance = features.new_empty(image.shape[:2])
     # Detached: the autograd node owns the backward function, which must not refer to the node's own results.
     arguments = features.detach(), lists, packed, image.detach(), transmittance.detach(), alpha_threshold
-    on_gpu = features.device.type == "cuda"
     gradient_rows = blend_on_cuda(*arguments, deterministic) if on_gpu else blend_on_cpu(*arguments)
 
     def backward(grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:

@@ -9,6 +9,7 @@ import torch
 import warp as wp
 
 from ..errors import SehdrError
+from ..limits import available_memory
 
 try:
     import resource
@@ -19,6 +20,7 @@ REMEDY = "use fewer Gaussians or a smaller image"
 TRAINING_REMEDY = "use fewer Gaussians (densification.cap_max) or a smaller image (--max-size)"
 
 COMPILER_BYTES = 64 << 20  # Half of it is too little for a kernel of the CPU
+LARGE = 1 << 30  # Bytes; asking the system about fewer would take longer than a small render
 
 
 class OutOfMemory(SehdrError):
@@ -44,6 +46,12 @@ def check_room_to_compile() -> None:
         return
     if limit - int(status.read_text().split()[0]) * resource.getpagesize() < COMPILER_BYTES:
         raise MemoryError(f"the compiler of kernels cannot allocate {COMPILER_BYTES >> 20} MiB")
+
+
+def check_room(count: int) -> None:
+    """Raise MemoryError for many bytes that the system cannot give: Linux ends a process that writes to them."""
+    if count >= LARGE and count > available_memory():
+        raise MemoryError(f"the system cannot allocate {count} bytes")
 
 
 def warp_memory_bytes(device: torch.device) -> int:
