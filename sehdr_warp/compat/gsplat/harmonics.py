@@ -8,10 +8,12 @@ from torch import Tensor
 from ...rasterizer import spherical_harmonics as evaluate_lower
 from ...rasterizer.checks import check_shape, check_tensors, integer
 from ...rasterizer.ops.harmonics import MAX_DEGREE
+from ...rasterizer.torch_contract import torch_operation
 
 HIGHEST_DEGREE = 4
 
 
+@torch_operation
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
     """Evaluate spherical harmonics along directions.
 

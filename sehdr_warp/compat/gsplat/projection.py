@@ -168,6 +168,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     ).unflatten(-1, (3, 3))
 
 
+@torch_operation
 def quat_scale_to_covar_preci(
     quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:

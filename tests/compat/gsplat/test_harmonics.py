@@ -71,3 +71,14 @@ def test_misfits_of_coefficients_are_named():
     ):
         with pytest.raises((ValueError, TypeError), match=message):
             gsplat.spherical_harmonics(*arguments)
+
+
+def test_autocast_lowers_no_precision():
+    generator = torch.Generator().manual_seed(0)
+    directions, coefficients = (torch.randn(5, *shape, generator=generator) for shape in ((3,), (25, 3)))
+    quats, scales = torch.randn(5, 4, generator=generator), torch.rand(5, 3, generator=generator)
+    values = gsplat.spherical_harmonics(4, directions, coefficients.bfloat16().float())
+    covars = gsplat.quat_scale_to_covar_preci(quats, scales)[0]
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(gsplat.spherical_harmonics(4, directions, coefficients.bfloat16()), values)
+        assert torch.equal(gsplat.quat_scale_to_covar_preci(quats, scales)[0], covars)
