@@ -1,6 +1,8 @@
 """Memory: how much Warp holds beside torch's allocator, and one clear line when there is not enough."""
 
+import ctypes
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,8 +52,17 @@ def check_room_to_compile() -> None:
 
 def check_room(count: int) -> None:
     """Raise MemoryError for many bytes that the system cannot give: Linux ends a process that writes to them."""
-    if count >= LARGE and count > available_memory():
+    if count < LARGE or count <= available_memory():
+        return
+    return_freed_memory()  # What a training keeps of its last step, and the system does not count as available
+    if count > available_memory():
         raise MemoryError(f"the system cannot allocate {count} bytes")
+
+
+def return_freed_memory() -> None:
+    """Return freed memory that glibc keeps in the process to the system; does nothing on other systems."""
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+        libc.malloc_trim(0)
 
 
 def warp_memory_bytes(device: torch.device) -> int:

@@ -12,6 +12,7 @@ import torch
 
 from ..errors import require_extra
 from ..parallel import thread_count
+from ..rasterizer.memory import return_freed_memory
 from ..rasterizer.precompile import precompiled, training_kernels
 from ..runs.config import Config
 
@@ -86,7 +87,7 @@ def _keep_memory(keep: bool) -> None:
         libc.mallopt(mmap_max, 0 if keep else 1 << 16)
         libc.mallopt(trim_threshold, 2**31 - 1 if keep else 1 << 17)
         if not keep:
-            libc.malloc_trim(0)
+            return_freed_memory()
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import resource
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ import torch
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer import memory, rasterize
 from sehdr_warp.rasterizer.memory import OutOfMemory, failed_allocation
+from sehdr_warp.training.process_settings import torch_settings
 
 from .scenes import random_scene
 
@@ -166,6 +168,24 @@ def test_an_image_larger_than_the_memory_is_refused_before_it_is_written(monkeyp
     scene = random_scene(count=1, channels=3, width=16384, height=16384).to(torch.float32, "cpu")
     with pytest.raises(OutOfMemory, match=r"cpu: 9.00 GiB could not be allocated with 1 Gaussians, an image of 16384"):
         rasterize(*scene.arguments)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs glibc")
+def test_memory_that_a_training_freed_is_there_for_its_next_step(monkeypatch):
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    limit = resident() + (96 << 20)
+    monkeypatch.setattr(memory, "available_memory", lambda: limit - resident())
+    monkeypatch.setattr(memory, "LARGE", 1)
+    with torch_settings(deterministic=False):
+        steps = [torch.ones(4 << 20) for _ in range(5)]  # 16 MiB each
+        last = torch.ones(1 << 20)  # Above them, so that they stay in the process
+        del steps
+        memory.check_room(64 << 20)
+        with pytest.raises(MemoryError):
+            memory.check_room(128 << 20)
+    assert len(last) == 1 << 20
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
