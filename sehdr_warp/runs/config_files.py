@@ -7,7 +7,7 @@ import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from functools import reduce
+from functools import cache, reduce
 from importlib import resources
 from operator import attrgetter
 from pathlib import Path
@@ -166,6 +166,25 @@ def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping
     if path in RENAMED:
         raise InputError(source, f"{problem} has another name since version 0.3", f"write {RENAMED[path]}")
     raise InputError(flag or source, problem, _REMEDY)
+
+
+def config_of_run(values: dict, file: Path) -> Config:
+    """Return config_from_dict() of a run's values; a field that is gone is left out with a warning, not refused.
+
+    The run was trained with it, and its checkpoint states the hash of its file, so nobody can leave it out there.
+    """
+    for path in GONE:
+        part, _, name = path.rpartition(".")
+        if isinstance(table := values.get(part), dict) and table.get(name):
+            _warn_of_gone_field(file, path, json.dumps(table[name]))
+            values = values | {part: table | {name: 0}}
+    return config_from_dict(values, file)
+
+
+@cache  # A command reads the config several times.
+def _warn_of_gone_field(file: Path, path: str, value: str) -> None:
+    text = "%s: %s = %s is of an earlier version and gone; a training that goes on does without it"
+    log.warning(text, file, path, value)
 
 
 def field_and_problem(validation: ValidationError) -> tuple[str, str]:

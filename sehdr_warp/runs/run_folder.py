@@ -37,7 +37,7 @@ from ..scene.images.ldr_files import MAX_PIXELS
 from ..scene.lens import Lens
 from .checkpoint import Checkpoint, read_checkpoint
 from .config import Config
-from .config_files import config_from_dict, override_config
+from .config_files import config_of_run, override_config
 from .scene_description import describe_scene, scene_difference
 from .values import (
     FORMAT,
@@ -158,7 +158,7 @@ class RunFolder:
     def read_config(self) -> Config:
         """Return the config of the training, with the iterations that it was extended to; see also finished_at()."""
         self.read_info()  # It names a run of another version as such.
-        config = config_from_dict(read_object(self._no_link(self.config_file)), self.config_file)
+        config = config_of_run(read_object(self._no_link(self.config_file)), self.config_file)
         if not self.extension.is_file():
             return config
         iterations = self._extension("iterations", config.schedule.iterations)

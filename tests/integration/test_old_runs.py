@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene.images.hdr_files import read_hdr
 
 from ..refusals import call, refused
@@ -30,3 +31,13 @@ def test_a_run_of_version_0_3_renders_exports_and_resumes(tmp_path):
     assert call("export", run, "--out", tmp_path / "scene.ply", "--device", "cpu", "-q") == 0
     assert call("train", "--resume", "--out", run, "--iterations", 24, "--device", "cpu", "-q") == 0
     assert (run / "checkpoints" / "iteration_00000024").is_dir()
+
+
+def test_a_run_trained_by_a_field_that_is_gone_is_read_with_one_warning(tmp_path, caplog):
+    """Its config.json cannot be edited, because the checkpoint states the hash of that file."""
+    run = shutil.copytree(DATA / "run-0.3", tmp_path / "run")
+    config, file = RunFolder(run).read_config(), run / "config.json"
+    file.write_text(file.read_text().replace('"prune_near_angle": 0.0', '"prune_near_angle": 0.1'))
+    assert RunFolder(run).read_config() == RunFolder(run).read_config() == config
+    (warning,) = caplog.messages
+    assert warning.startswith(f"{file}: mcmc.prune_near_angle = 0.1 is of an earlier version and gone")
