@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import SehdrError
+from ..errors import InputError, SehdrError
 from ..model.baking import field_of
 from ..model.color_models import rec709_of
 from ..model.confidence import Evidence, gather_evidence
@@ -106,10 +106,15 @@ class RenderableScene:
 
         `data` are names of further attributes, "confidence" and "clipped": images that render_confidence() and
         render_clipped() return, here in the same rasterization unless a finer one is averaged.
+
+        Raises:
+            InputError: for another name.
         """
+        sources = {"confidence": lambda: self.field.confidence, "clipped": self.clipped_share}
+        if unknown := [name for name in data if name not in sources]:
+            raise InputError("data", f"has {unknown[0]!r}", f"name any of {', '.join(sources)}")
         factor = self.samples_across_pixel(camera) if supersample else 1
         finer = camera.resized(factor * camera.width, factor * camera.height)
-        sources = {"confidence": lambda: self.field.confidence, "clipped": self.clipped_share}
         values = {name: share for name in data if (share := sources[name]()) is not None}
         view = self.field.render(finer, degree=self.degree, data=values if factor == 1 else {})
         view = replace(view, hdr=self.in_rec709(view.hdr)).reduced(factor)

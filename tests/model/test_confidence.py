@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.model.confidence import (
     CLIPPED_STOPS,
     HALF_CONFIDENCE_PIXELS,
@@ -170,3 +171,5 @@ def test_a_picture_and_its_data_are_one_rasterization_of_the_same_bits(device, f
     assert whole.confidence is None and whole.clipped is None
     model.confidence = None
     assert scene.render(CAMERA, data=["confidence"]).confidence is None
+    with pytest.raises(InputError, match="data: has 'depth'; name any of confidence, clipped"):
+        scene.render(CAMERA, data=("confidence", "depth"))
