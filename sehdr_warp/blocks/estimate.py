@@ -20,7 +20,7 @@ def estimate(plan: Plan, requested: Config, device: torch.device, gpus: int = 1)
     """Return ways to train a set with their cost, and which of them is recommended.
 
     Blocks share the mcmc.cap_density of the `requested` config, 120 by default, and one training has that of its plan,
-    240 on a GPU with many photos: see BlockPlan.config_of(). On the CPU, figures for H100 follow those of this machine.
+    more on a GPU with many photos: see BlockPlan.config_of(). On the CPU, figures of an H100 follow this machine's.
     """
     facts, config = plan.facts, plan.config
     pixels, steps = facts.pixels / facts.photos, config.schedule.iterations
