@@ -25,7 +25,7 @@ from ..scene import Scene
 from ..scene.normalization import Normalization, normalization_of
 from .compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from .hdr_truth import check_scene_truth
-from .initialization import depth_of_points, make_field, make_matcher, response_for_training
+from .initialization import check_views, depth_of_points, make_field, make_matcher, response_for_training
 from .plan import check_fields, make_plan
 from .process_settings import summary_writer
 from .ranks import Ranks
@@ -141,6 +141,7 @@ def _new_trainer(
 
     `scene` and, after the compensation, `photos` are in their own coordinates; normalized ones in the Gaussians'.
     """
+    check_views(scene)
     normalization = normalization_of(scene)
     normalized_scene = normalization.scene(scene)
     plan = make_plan(normalized_scene, config, device) if config.plan.enabled else None

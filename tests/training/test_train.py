@@ -250,14 +250,15 @@ def test_photos_without_light_or_shadow_are_refused(scene, tmp_path, value, word
         train(replace(scene, views=views), tmp_path / "run", quick(), device="cpu")
 
 
-def test_one_view_is_refused_and_the_folder_stays_as_it_is(scene, tmp_path):
-    one = replace(scene, views=scene.views[:1])
-    with pytest.raises(InputError, match="1 training view"):
-        train(one, tmp_path / "run", quick(), device="cpu")
+@pytest.mark.parametrize("count", [0, 1])
+def test_too_few_views_are_refused_and_the_folder_stays_as_it_is(scene, tmp_path, count):
+    few = replace(scene, views=scene.views[:count])
+    with pytest.raises(InputError, match=f"{count} training view"):
+        train(few, tmp_path / "run", quick(), device="cpu")
     assert not (tmp_path / "run").exists()
     train(scene, tmp_path / "run", quick(**{"schedule.iterations": 2}), device="cpu")
     with pytest.raises(InputError):
-        train(one, tmp_path / "run", quick(), device="cpu", overwrite=True)
+        train(few, tmp_path / "run", quick(), device="cpu", overwrite=True)
     assert load_run(tmp_path / "run").iterations == 2
 
 
