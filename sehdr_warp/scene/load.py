@@ -209,7 +209,7 @@ def parse_dataset(
 def _place(
     dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto], cache: Path | str | None, root: Path
 ) -> tuple[DataparserOutputs, list[str]]:
-    """Return bare photos, or frames of the video `root`, with the cameras of a run, or else with found ones.
+    """Return bare photos, or frames of the video `root`, with the cameras of a run or of structure from motion.
 
     The second result names the photos without a camera, which are left out.
     """

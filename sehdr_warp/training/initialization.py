@@ -220,7 +220,7 @@ def make_matcher(scene: Scene, response: Response, device: torch.device | str, d
 
 
 def depth_of_points(scene: Scene) -> float:
-    """Return the median depth of the points in the training views, of fewer than FEWEST_POINTS focus_distance()."""
+    """Return the median depth of the points in the training views, or focus_distance() if these are too few."""
     cameras, points = perspective_cameras(scene.train_views), every_nth(scene.points, MOST_DEPTHS)
     homogeneous = np.c_[points, np.ones(len(points))]
     depths = np.concatenate([homogeneous[each.project(points).inside] @ each.world_to_camera[2] for each in cameras])

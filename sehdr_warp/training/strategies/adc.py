@@ -142,7 +142,7 @@ def duplicate(gaussians: Gaussians, mask: Tensor) -> dict[str, Tensor]:
 
 
 def split(gaussians: Gaussians, mask: Tensor, generator: torch.Generator) -> Iterator[dict[str, Tensor]]:
-    """Yield twice a smaller Gaussian for each one of a mask [N], at a point sampled from it."""
+    """Yield, twice, a smaller Gaussian for each one of a mask [N], at a point sampled from that one."""
     parents = mask.nonzero()[:, 0]
     for _ in range(2):
         rows = gaussians.rows(parents)
