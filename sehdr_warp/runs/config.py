@@ -175,8 +175,8 @@ class McmcConfig(_Table):
     """strength of the noise on positions, in units of their learning rate; 0 disables"""
     prune_near_points: Fraction = 0.5
     """relocate Gaussians that a training photo shows nearer than this share of the distance of its nearest points in
-    the set, of which 2 % do not count (floaters in front of cameras); not where a photo shows less than a tenth of the
-    scene; 0 disables"""
+    the set, of which 2 % do not count (floaters in front of cameras); not in parts of a photo without points, and not
+    where a photo shows less than a tenth of the scene; 0 disables"""
 
 
 class AdcConfig(_Table):

@@ -45,7 +45,7 @@ from .run_output import RunOutput
 from .scene_facts import is_large
 from .seeding import make_seeds
 from .step_runner import StepRunner
-from .strategies import SEED_STRIDE, Seeds, TrainingCameras, distances_of_points, make_strategy
+from .strategies import SEED_STRIDE, PointDistances, Seeds, TrainingCameras, distances_of_points, make_strategy
 from .training_progress import TrainingProgress
 
 log = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ class Trainer:
         first_iteration: Iterations done before this process.
         total: Iterations in all.
         large_scene: Whether photos show little of the scene, see scene_facts.is_large().
-        nearest_points: Distances of the nearest points from the cameras, see strategies.floaters; 0 in a large scene.
+        nearest_points: Distances of the nearest points, see strategies.floaters; 0 in a large scene.
         median_depth: Depth around which photos are matched, see depth_of_points().
         batch: Photos of a step, one for each rank; each counts as an iteration.
         step_batch: Photos of the last step: `batch`, or fewer if fewer iterations were left.
@@ -96,7 +96,7 @@ class Trainer:
         get_matcher: Callable[[], Matcher] | None = None,
         ranks: Ranks | None = None,
         large_scene: bool | None = None,
-        nearest_points: list[float] | None = None,
+        nearest_points: PointDistances | None = None,
         median_depth: float | None = None,
     ):
         """Prepare a training on the device of the field; create_trainer() does this for a scene and a run folder.

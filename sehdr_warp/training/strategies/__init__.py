@@ -9,7 +9,7 @@ import math
 from ...runs.config import Config
 from .adc import AdcStrategy
 from .base import SEED_STRIDE, MakeSeeds, Schedule, Seeds, Strategy
-from .floaters import TrainingCameras, distances_of_points
+from .floaters import PointDistances, TrainingCameras, distances_of_points
 from .mcmc import DENSE, McmcStrategy, mcmc_cap
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "AdcStrategy",
     "MakeSeeds",
     "McmcStrategy",
+    "PointDistances",
     "Seeds",
     "Strategy",
     "TrainingCameras",
