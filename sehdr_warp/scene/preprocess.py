@@ -165,7 +165,7 @@ class _Resampler:
 
 
 class _Preprocessor:
-    """Makes the views of a set's photos, on several threads, and collects what the scene's notes say of them."""
+    """Preprocessor of a set: turns photos into views on several threads, and collects notes about them."""
 
     def __init__(self, max_size: int | None, response: "Response", alpha: str, to_rec709: np.ndarray | None):
         self.max_size, self.response, self.alpha, self.to_rec709 = max_size, response, alpha, to_rec709
