@@ -141,11 +141,11 @@ def _rows_table(name: str, result: dict) -> Iterable[str]:
 
 def _captures_tables(result: dict) -> Iterable[str]:
     figures = ("psnr", "best", "psnr_fitted", "ssim", "lpips", "seconds", "reached", "memory", "gaussians")
-    for (part,), measured in groups([{"part": None} | row for row in result["rows"]], "part").items():
+    for (part,), part_rows in groups([{"part": None} | row for row in result["rows"]], "part").items():
         if part:
             yield f"## {part}"
         table = []
-        for rows in groups(measured, "capture", "size", "method", "iterations").values():
+        for rows in groups(part_rows, "capture", "size", "method", "iterations").values():
             columns = [name for name in figures if all(row.get(name) is not None for row in rows)]
             means = {name: fmean(row[name] for row in rows) for name in columns}
             spread = stdev(row["psnr"] for row in rows) if len(rows) > 1 else None

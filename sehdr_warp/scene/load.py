@@ -121,7 +121,7 @@ def load_scene(
     if dataset.kind != "float":
         usable = {view.name for view in scene.views}
         note = exposures_note([record for name, record in records.items() if name in usable])
-        scene = replace(scene, notes=(*scene.notes, *note))
+        scene = replace(scene, notes=scene.notes + note)
     return replace(
         scene,
         chosen_by=choice.chosen_by,

@@ -98,7 +98,7 @@ def floater_mask(gaussians: Gaussians, cameras: TrainingCameras, options: McmcCo
 def _cells_of(points: Tensor, views: Tensor, cameras: TrainingCameras) -> tuple[Tensor, Tensor]:
     """Return the cells [P] of photos that points [P, 3] fall on, and whether the views [P] of the cameras contain them.
 
-    The cell of a point outside of the view is any.
+    Points outside of a view get cell 0.
     """
     world_to_camera, intrinsics, sizes = cameras.world_to_camera[views], cameras.intrinsics[views], cameras.sizes[views]
     local = (world_to_camera[:, :3, :3] @ points[:, :, None])[..., 0] + world_to_camera[:, :3, 3]
