@@ -15,7 +15,6 @@ TOPICS = {
         "blend_blocks", "clipped_light", "culling", "extremes", "properties", "rasterize", "residual_sampling",
     },
     "response": {"responses"},
-    "splats": {"compressed_files", "npm_parsers", "other_tools", "splat_files"},
     "training": {
         "bad_input", "confidence", "deterministic", "divergence", "fields", "nodes", "out_of_memory", "reserved_rows",
         "resume", "rivals", "units",

@@ -8,8 +8,7 @@ from sehdr_warp.rasterizer import spherical_harmonics
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.splats.arrays import colors_of_basis, harmonic_basis
-
-from ..splats.test_splat_files import gaussians
+from tests.splats.samples import gaussians
 
 NOWHERE = np.empty((0, 3))
 SRGB = response_by_name("srgb")

@@ -25,9 +25,9 @@ from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera, load_cameras, load_scene, look_at
 from sehdr_warp.scene.gravity import UpDirection, is_pitch_known, up_direction
 from sehdr_warp.splats import read_gaussians, write_gaussians
+from tests.splats.samples import gaussians
 
 from ..make_scenes import write_colmap
-from ..splats.test_splat_files import gaussians
 from .helpers import AnalyticRun, Entry, camera, read_exr
 
 

@@ -9,9 +9,7 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, streamed_sog, write_gaussians
 from tests.make_scenes import edited_json
-
-from .test_compressed_files import assert_alike, natural
-from .test_npm_parsers import package
+from tests.splats.samples import assert_alike, natural, package
 
 
 @pytest.fixture

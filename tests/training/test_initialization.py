@@ -33,8 +33,8 @@ from sehdr_warp.training.initialization import (
 )
 from sehdr_warp.training.seeding import brighten_clipped, expected_excess
 from sehdr_warp.training.train import create_trainer
+from tests.splats.samples import gaussians
 
-from ..splats.test_splat_files import gaussians
 from .toy import orbit_camera, toy_scene
 from .wall_and_lamp import LAMP, WALL, wall_and_lamp
 

@@ -16,9 +16,8 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import load_cameras
 from sehdr_warp.splats import read_gaussians
+from tests.splats.samples import LOSSY_SUFFIXES, gaussians, write_ply
 
-from ...splats.test_other_tools import write_ply
-from ...splats.test_splat_files import LOSSY_SUFFIXES, gaussians
 from ..helpers import Entry, camera
 
 

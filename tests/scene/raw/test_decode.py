@@ -22,10 +22,10 @@ from sehdr_warp.scene.readers.bare_photos import find_photos
 from sehdr_warp.scene.sfm.reconstruction import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
 from sehdr_warp.training.plan import make_plan
+from tests.splats.samples import gaussians
 
 from ...make_scenes import edited_json, write_colmap
 from ...output.helpers import camera
-from ...splats.test_splat_files import gaussians
 from .dng_files import TO_CAMERA, write_dng
 
 BALANCE = np.array([0.5, 1.0, 0.7])
