@@ -18,14 +18,15 @@ from .geometry import geometry, matrix
 
 
 @cache
-def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool):
+def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool, own_cameras: bool):
     """Return the projection kernel for one scalar type.
 
     The kernel's `visibility` is the forward pass's extents in the adjoint, and None in the forward pass.
 
     antialiased: lower the opacity by sqrt(det / det_blurred), so that the blur by eps2d keeps a Gaussian's energy (Yu
     et al. 2024, Mip-Splatting). differentiate_compensation: differentiate that factor with respect to the covariance,
-    as gsplat does; otherwise it is constant in the gradient.
+    as gsplat does; otherwise it is constant in the gradient. own_cameras: each Gaussian has a row of
+    world_to_camera and intrinsics, so that no two add to the same gradient; otherwise all share the first row.
     """
     g = geometry(dtype)
     real, vec2, vec3, vec4, mat44 = g.real, g.vec2, g.vec3, g.vec4, g.mat44
@@ -68,8 +69,9 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
         if visibility:
             if visibility[i][0] <= real(0.0):
                 return
-        pose = world_to_camera[0]
-        pinhole = intrinsics[0]
+        camera = i * wp.static(int(own_cameras))
+        pose = world_to_camera[camera]
+        pinhole = intrinsics[camera]
         fx = pinhole[0]
         fy = pinhole[1]
         rotation = g.mat33(

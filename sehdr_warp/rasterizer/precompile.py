@@ -46,7 +46,7 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
     blend = [] if channels is None else [blend_cpu.backward_kernel(*kind), blend_cpu.forward_kernel(*kind)]
     return [
         *(shared_ranges.share_ranges, plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),
-        *(*blend, projection_kernel(real, antialiased, False), distance.compare),
+        *(*blend, projection_kernel(real, antialiased, False, False), distance.compare),
         *(harmonics.harmonics_kernel(real, 0), lists.pack_splats, lists.key_by_depth, lists.emit_by_depth),
         *(tiles.count_tiles, tiles.place_intersections, distance.blur_columns),
         *(distance.blur_derivatives, distance.gradient),

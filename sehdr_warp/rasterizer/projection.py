@@ -72,12 +72,20 @@ def project_to_camera(
 
     differentiate_compensation: differentiate the factor of antialiased opacities with respect to the covariance.
     """
-    antialiased = options.antialiased
-    kernel = projection_kernel(warp_scalar(means.dtype), antialiased, differentiate_compensation and antialiased)
+    antialiased, own_cameras = options.antialiased, options.deterministic and adds_in_any_order(means.device)
+    kinds = antialiased, differentiate_compensation and antialiased, own_cameras
+    kernel = projection_kernel(warp_scalar(means.dtype), *kinds)
     tensors = means, log_scales, quaternions, opacities, world_to_camera, intrinsics
     inputs = tuple(tensor.contiguous() for tensor in tensors)
+    if own_cameras:  # Views, whose gradients torch sums over the Gaussians, in a fixed order.
+        inputs = *inputs[:4], *(tensor.expand(len(means), *tensor.shape) for tensor in inputs[4:])
     outputs = [means.new_empty(len(means), *shape) for shape in ((2,), (3,), (), (), (2,))]
     return ProjectedGaussians(*launch_projection(kernel, inputs, projection_parameters(options), outputs))
+
+
+def adds_in_any_order(device: torch.device) -> bool:
+    """Return whether threads of a device add to one number in any order; tests without a GPU replace this function."""
+    return device.type == "cuda"
 
 
 def projection_parameters(options: RenderOptions) -> tuple:
@@ -94,7 +102,8 @@ def launch_projection(
 
     Args:
         kernel: takes inputs, parameters, visibility in the adjoint (else None), and outputs.
-        inputs: four tensors with a row for each Gaussian, then those that all share (the camera); contiguous.
+        inputs: four tensors with a row for each Gaussian, then those that all share (the camera); contiguous, or views
+            that are expanded to all Gaussians.
         parameters: that are not tensors.
         outputs: with a row for each Gaussian; the last one, visibility, is not differentiable.
     """

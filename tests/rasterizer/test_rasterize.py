@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import rasterize
+from sehdr_warp.rasterizer import projection, rasterize
 from sehdr_warp.rasterizer.reference import rasterize_reference
 
 from .scenes import finite_differences, random_like, random_scene, relative_error
@@ -148,13 +148,48 @@ def test_deterministic_gradients_repeat_bit_for_bit_and_are_the_others(device):
             tensor.grad = None
         rendering = rasterize(*scene.arguments, deterministic=deterministic, max_intersections=max_intersections)
         backward(rendering)
-        return [rendering.image, *(tensor.grad for tensor in scene.tensors[:5])]
+        return [rendering.image, *(tensor.grad for tensor in scene.tensors)]
 
     first = render()
     for again in (render(), render(), render(max_intersections=100_000)):
         assert all(torch.equal(a, b) for a, b in zip(first, again))
     for ours, other in zip(first, render(deterministic=False)):
         assert relative_error(ours, other) < 1e-5
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="the CPU is tested with any number of threads")
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_deterministic_gradients_of_cameras_repeat_bit_for_bit_on_a_gpu(cameras):
+    *gaussians, pose, intrinsics = random_scene(count=50_000, width=400, height=400, size=0.02).tensors
+    if cameras > 1:
+        pose, intrinsics = torch.stack([pose] * cameras), torch.stack([intrinsics] * cameras)
+    tensors = [tensor.to("cuda:0", torch.float32).requires_grad_() for tensor in (*gaussians, pose, intrinsics)]
+
+    def gradients():
+        image = rasterize(*tensors, 400, 400, deterministic=True).image
+        return torch.autograd.grad(image, tensors[5:], random_like(image, 3))
+
+    first = gradients()
+    for _ in range(20):
+        assert all(torch.equal(a, b) for a, b in zip(first, gradients(), strict=True))
+
+
+@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
+def test_summed_gradients_of_each_gaussians_own_camera_are_the_reference(device, antialiased, monkeypatch):
+    rows, zero_gradients = [], projection.zero_gradients
+
+    def watch(tensors, needed):
+        rows[:] = zero_gradients(tensors, needed)
+        return rows
+
+    monkeypatch.setattr(projection, "adds_in_any_order", lambda device: True)
+    monkeypatch.setattr(projection, "zero_gradients", watch)
+    ours, truth = random_scene().to(torch.float64, device), random_scene().to(torch.float64)
+    backward(rasterize(*ours.arguments, antialiased=antialiased, deterministic=True))
+    backward(rasterize_reference(*truth.arguments, antialiased=antialiased))
+    assert [row.shape for row in rows[4:]] == [(150, 4, 4), (150, 4)]
+    for name, tensor, true in zip(NAMES, ours.tensors, truth.tensors, strict=True):
+        assert relative_error(tensor.grad, true.grad) < 1e-11, name
 
 
 def test_a_rendering_prints_in_one_line():

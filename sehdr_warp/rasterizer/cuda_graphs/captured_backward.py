@@ -159,7 +159,7 @@ def _fixed_projection_backward(
     grad_conics, grad_opacities = rows.as_strided(*layout.conics), rows.as_strided(*layout.opacities)
     pairs = zip(gaussians, layout.gaussians, strict=True)
     results = [None if view is None else torch.empty_like(tensor) for tensor, view in pairs]
-    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased, False)
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased, False, False)
     upstream = grad_means2d, grad_conics, grad_depths, grad_opacities, None
     parameters = projection_parameters(options)
     arguments, gradients = adjoint_arguments(gaussians, parameters, projected.extents, upstream, results)

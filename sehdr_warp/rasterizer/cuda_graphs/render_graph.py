@@ -221,6 +221,6 @@ def _fixed_projection(
 ) -> FixedLaunch:
     """Return the launch of _project() for any tensors, to the same outputs."""
     gaussians = tensors.without_features
-    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased, False)
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased, False, False)
     arguments = *gaussians, *projection_parameters(options), None, *projected
     return fixed_launch(kernel, len(projected.depths), *arguments, by_address=gaussians)
