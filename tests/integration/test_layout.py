@@ -14,7 +14,6 @@ TOPICS = {
     "rasterizer": {
         "blend_blocks", "clipped_light", "culling", "extremes", "properties", "rasterize", "residual_sampling",
     },
-    "response": {"responses"},
     "training": {
         "bad_input", "confidence", "deterministic", "divergence", "fields", "nodes", "out_of_memory", "reserved_rows",
         "resume", "rivals", "units",
