@@ -250,11 +250,12 @@ def lists_by_tile(
     Returns TileLists.tile_ranges, gaussians, subtile_masks (None on the CPU and without packed Gaussians, as for
     rasterize_directions()) and emit_indices (None unless keep_emit_order).
     """
-    sort = _count_by_tile if tiles.device.type == "cpu" else _sort_by_tile
+    sort = count_by_tile if tiles.device.type == "cpu" else sort_by_tile
     return sort(tiles, gaussians, length, packed, grid, keep_emit_order)
 
 
-def _sort_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order):
+def sort_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order):
+    """Sort by a radix sort, best on GPUs."""
     emit_indices = None
     if keep_emit_order:
         emit_indices = torch.empty(2 * length, dtype=torch.int32, device=tiles.device)
@@ -269,8 +270,8 @@ def _sort_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order):
     return tile_ranges, gaussians, subtile_masks, emit_indices
 
 
-def _count_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order):
-    """Sort by counting: each thread takes a few chunks, and within a tile those of the first chunk come first."""
+def count_by_tile(tiles, gaussians, length, packed, grid, keep_emit_order):
+    """Sort by counting, best on CPUs: each thread takes a few chunks, and within a tile the first chunk comes first."""
     tiles, gaussians = tiles[:length], gaussians[:length]
     chunks = max(1, min(2 * thread_count(), length // MIN_CHUNK))
     counts = torch.zeros(chunks, grid.tiles + 1, dtype=torch.int32, device=tiles.device)

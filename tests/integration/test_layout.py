@@ -11,9 +11,7 @@ TOPICS = {
     "compat/gsplat": {"against_gsplat", "simple_trainer"},
     "kernels": {"cuda_compilation"},
     "output": {"blender"},
-    "rasterizer": {
-        "blend_blocks", "clipped_light", "culling", "extremes", "properties", "rasterize", "residual_sampling",
-    },
+    "rasterizer": {"culling", "extremes", "properties", "rasterize"},
     "training": {
         "bad_input", "confidence", "deterministic", "divergence", "fields", "nodes", "out_of_memory", "reserved_rows",
         "resume", "rivals", "units",

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.kernels.plane_sweep import sweep
 from sehdr_warp.rasterizer.ops.plane_sweep import PhotoSet, matched_points, matching_costs, trusted_depths
+from sehdr_warp.rasterizer.warp_launch.launching import launch
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.camera import look_at
 
@@ -47,28 +49,33 @@ def reference(images, cameras, pixel, depth) -> float:
     return float(np.mean(sorted(costs)[: max(2, (len(costs) + 1) // 2)])) if len(costs) > 1 else 0.5
 
 
-def test_costs_are_the_reference(photos, device):
+def costs_by_threads(photo_set, pixels, depths):
+    """matching_costs() as a GPU computes them, one thread a cost, on either device."""
+    costs = torch.empty_like(depths)
+    launch(sweep, depths.numel(), *vars(photo_set).values(), pixels, depths, costs)
+    return costs
+
+
+@pytest.mark.parametrize("costs_of", [matching_costs, costs_by_threads])
+def test_costs_are_the_reference(photos, device, costs_of):
     images, cameras = photos
     pixels = [(0, 11, 8), (0, 4, 5), (0, 20, 14), (1, 10, 9), (1, 2, 2), (2, 15, 6)]
     depths = [0.4, 1.0, 2.0, 5.0, 40.0]
     expected = [[reference(images, cameras, pixel, depth) for depth in depths] for pixel in pixels]
     inputs = torch.tensor(pixels, dtype=torch.int32, device=device), torch.tensor(depths, device=device).repeat(6, 1)
-    costs = matching_costs(PhotoSet.of(images, cameras, NEIGHBORS, device), *inputs)
+    costs = costs_of(PhotoSet.of(images, cameras, NEIGHBORS, device), *inputs)
     np.testing.assert_allclose(costs.cpu(), expected, atol=2e-5)
     # Places that two neighbors see, and places that they do not, are both among them; the last view has one neighbor.
     assert 0.5 in costs[0] or 0.5 in costs[1]
     assert (costs[:5] < 0.5).any() and (costs[5] == 0.5).all()
 
 
+@pytest.mark.parametrize("costs_of", [matching_costs, costs_by_threads])
 @pytest.mark.parametrize("depth", [1e-30, 1e30, 3e38, float("inf"), float("nan"), 0.0, -1.0])
-def test_impossible_depths_cost_what_is_not_seen(photos, device, depth):
-    images, cameras = photos
+def test_impossible_depths_cost_what_is_not_seen(photos, device, depth, costs_of):
+    photo_set = PhotoSet.of(*photos, NEIGHBORS, device)
     pixels = torch.tensor([[0, 11, 8]], dtype=torch.int32, device=device)
-    cost = float(
-        matching_costs(
-            PhotoSet.of(images, cameras, NEIGHBORS, device), pixels, torch.full((1, 1), depth, device=device)
-        )
-    )
+    cost = float(costs_of(photo_set, pixels, torch.full((1, 1), depth, device=device)))
     assert 0 <= cost <= 0.25 or cost == 0.5
 
 

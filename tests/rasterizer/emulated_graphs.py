@@ -50,7 +50,7 @@ def emulate(monkeypatch) -> None:
     monkeypatch.setattr(cache, "stream_handle", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device=None: None)
     monkeypatch.setattr(torch, "empty", lambda *shape, pin_memory=False, **options: empty(*shape, **options))
-    monkeypatch.setattr(tile_lists, "lists_by_tile", tile_lists._sort_by_tile)
+    monkeypatch.setattr(tile_lists, "lists_by_tile", tile_lists.sort_by_tile)
 
     def with_blocks(name, is_block):
         function = getattr(packing.PackedLaunch, name)

@@ -7,6 +7,11 @@ from torch import distributed
 from torch.distributed.tensor import distribute_tensor, init_device_mesh
 
 from sehdr_warp.rasterizer import rasterize, rasterize_directions, spherical_harmonics, ssim
+from sehdr_warp.rasterizer.losses.code_residual import CodeScale, code_residual
+from sehdr_warp.rasterizer.losses.photo_loss import photo_loss
+from sehdr_warp.rasterizer.ops.exposure_fusion import fuse_exposures
+from sehdr_warp.rasterizer.ops.interpolation import interpolate
+from sehdr_warp.rasterizer.ops.step_updates import AdamStep, adam_steps
 
 from .scenes import random_scene
 
@@ -166,6 +171,36 @@ def test_misfits_of_harmonics_are_named(degree, change, kind, message):
 def test_misfits_of_similarity_are_named(a, b, kind, message):
     with pytest.raises(kind, match=message):
         ssim(a, b)
+
+
+CODES, SCALE = torch.zeros(2, 3, 3, dtype=torch.uint8), CodeScale(torch.zeros(256, 3))
+IMAGE, SQUARE, ONE = torch.zeros(4, 3, 3), torch.zeros(4, 4), torch.ones(())
+LEARNED = torch.zeros(3), torch.zeros(3, 2, 8), torch.zeros(3, 1, 8), torch.zeros(3, 8, 1), torch.zeros(3, 1, 1)
+WEIGHTS = {"distance_weight": 0.8, "dissimilarity_weight": 0.2}
+
+
+def step_of(*tensors):
+    adam_steps([AdamStep(*tensors, ONE, 0.1)], ONE, betas=(0.9, 0.999), epsilon=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: code_residual(IMAGE, CODES, SCALE), r"expected uint8 or int16 \[4, 3, 3\]"),
+        (lambda: code_residual(IMAGE, IMAGE.short(), SCALE), r"expected uint8 or int16 \[4, 3, 3\]"),
+        (lambda: code_residual(IMAGE, IMAGE, SCALE), r"expected uint8 or int16 \[4, 3, 3\]"),
+        (lambda: photo_loss(IMAGE, CODES, SCALE, **WEIGHTS), "expected uint8 or int16"),
+        (lambda: fuse_exposures(torch.zeros(3, 9, 2), *LEARNED, scale=1.0), r"encoded has shape \[3, 9, 2\]"),
+        (lambda: fuse_exposures(torch.zeros(3, 9, 3).double(), *LEARNED, scale=1.0), "log_sigma is torch.float32"),
+        (lambda: interpolate(torch.zeros(3, 3), 0.0, 1.0, torch.zeros(2, 3)), "with 2 nodes at least"),
+        (lambda: interpolate(torch.zeros(8, 3), 0.0, 1.0, torch.zeros(2, 3).double()), "positions is torch.float64"),
+        (lambda: step_of(SQUARE, SQUARE[0], SQUARE, SQUARE), "gradient is torch.float32"),
+        (lambda: step_of(SQUARE, SQUARE, SQUARE, SQUARE.double()), "second moment is torch.float64"),
+    ],
+)
+def test_misfits_of_what_training_calls_are_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 def test_distributed_tensors_are_refused_by_a_sentence():

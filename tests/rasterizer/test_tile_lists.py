@@ -172,10 +172,10 @@ def test_intersections_counted_by_chunks_are_those_sorted(monkeypatch, count, ch
     tile_keys = [torch.randint(3, grid.tiles + 1, (2 * count,), generator=generator, dtype=torch.int32)]
     tile_keys.append(torch.randint(1000, (2 * count,), generator=generator, dtype=torch.int32))
     splats = PackedSplats(torch.zeros(1000, 4), torch.full((1000, 4), -1.0), None, None, None)
-    counted = tile_lists._count_by_tile(*(tensor.clone() for tensor in tile_keys), count, None, grid, keep_emit_order)
+    counted = tile_lists.count_by_tile(*(tensor.clone() for tensor in tile_keys), count, None, grid, keep_emit_order)
     copies = (tensor.clone() for tensor in tile_keys)
-    ranges, ones, corners, places = tile_lists._sort_by_tile(*tile_keys, count, splats, grid, keep_emit_order)
-    alike, *_, without, _ = tile_lists._sort_by_tile(*copies, count, None, grid, keep_emit_order)
+    ranges, ones, corners, places = tile_lists.sort_by_tile(*tile_keys, count, splats, grid, keep_emit_order)
+    alike, *_, without, _ = tile_lists.sort_by_tile(*copies, count, None, grid, keep_emit_order)
     assert torch.equal(alike, ranges) and without is None and len(corners) == count
     ours_ranges, ours_ones, _, ours_places = counted
     for ours, sorted_ones in zip((ours_ranges, ours_ones, ours_places), (ranges, ones, places), strict=True):

@@ -28,11 +28,12 @@ def opacity_penalty(
         active_count: [1] int32 on the device, the number of Gaussians if those behind them have an opacity of 0.
     """
     if opacities.device.type == "cuda":
-        return _OpacityPenalty.apply(opacities, extents, moments, weight, active_count)
+        return penalty_by_kernels(opacities, extents, moments, weight, active_count)
     if extents is not None:
         counts = extents[:, 0] > 0
-        opacities = opacities * (counts if moments is None else counts | (moments > 0))
-    return weight * opacities.sum() / (len(opacities) if active_count is None else active_count[0])
+        counts = counts if moments is None else counts | (moments > 0)
+        opacities = torch.where(counts, opacities, 0.0)  # Not 0 times an opacity that is not finite.
+    return weight * opacities.sum() / (max(1, len(opacities)) if active_count is None else active_count[0])
 
 
 class _OpacityPenalty(torch.autograd.Function):
@@ -57,3 +58,7 @@ class _OpacityPenalty(torch.autograd.Function):
         inputs = extents, ctx.moments, ctx.weight, ctx.active_count
         launch(kernel, ctx.count, *inputs, penalty_gradient.reshape(1), result)
         return result, None, None, None, None
+
+
+penalty_by_kernels = _OpacityPenalty.apply
+"""opacity_penalty() by kernels on either device."""

@@ -46,7 +46,7 @@ def fuse_exposures(
             return scale * (fusion_weights(encoded, *learned) * encoded).sum(dim=0)
     if encoded.requires_grad or requires_ordered_sums(encoded.device):
         return scale * (fusion_weights(encoded, *learned) * encoded).sum(dim=0)
-    return _Fusion.apply(encoded, *learned, scale)
+    return fuse_by_kernels(encoded, *learned, scale)
 
 
 def fusion_weights(encoded, log_sigma, inner, inner_bias, outer, outer_bias) -> Tensor:
@@ -98,6 +98,10 @@ class _Fusion(torch.autograd.Function):
         arguments = *by_point, *learned, grad_log_sigma
         launch(kernels.point_backward, encoded.shape, *arguments)
         return None, grad_log_sigma.sum(1), *grad_weights, None
+
+
+fuse_by_kernels = _Fusion.apply
+"""fuse_exposures() by kernels on either device; scale is the last argument."""
 
 
 def _flat(weights):

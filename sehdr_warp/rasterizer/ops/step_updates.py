@@ -51,13 +51,14 @@ def finiteness_of(gradients: Sequence[Tensor]) -> Tensor:
     On a CPU they are the norms of the gradients; on a GPU one number, 0 or infinity.
     """
     if gradients[0].device.type == "cuda":
-        return _nonfinite_by_kernel(gradients)
+        return nonfinite_by_kernel(gradients)
     with torch_threads(gradients[0].device):  # Threads change the last bits, but only finiteness counts.
         result = torch._foreach_norm(list(gradients))  # pyright: ignore[reportPrivateImportUsage]
     return torch.stack(result)
 
 
-def _nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
+def nonfinite_by_kernel(gradients: Sequence[Tensor]) -> Tensor:
+    """Do finiteness_of() by the kernel of a GPU, on either device."""
     result = gradients[0].new_zeros(1)
     flat = [gradient.reshape(-1) for gradient in gradients if gradient.numel()]
     for start in range(0, len(flat), kernels.TENSORS_PER_CHECK):
@@ -123,7 +124,7 @@ def adam_steps(
                 raise ValueError(f"the {name.replace('_', ' ')} is {actual}, expected contiguous float32 {list(shape)}")
     steps = [step for step in steps if step.parameter.numel()]
     if skipped.device.type == "cuda":
-        _steps_by_kernel(steps, skipped, betas, epsilon, active_count)
+        steps_by_kernel(steps, skipped, betas, epsilon, active_count)
         return
     numbers: Any = {"beta1": betas[0], "beta2": betas[1], "weight_decay": 0.0, "eps": epsilon, "found_inf": skipped}
     numbers |= {"amsgrad": False, "maximize": False}
@@ -133,7 +134,8 @@ def adam_steps(
             torch._fused_adam_(*lists, lr=float(rate), **numbers)  # pyright: ignore[reportPrivateImportUsage]
 
 
-def _steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, active_count=None) -> None:
+def steps_by_kernel(steps: Sequence[AdamStep], skipped, betas, epsilon, active_count=None) -> None:
+    """Do adam_steps() by the kernel of a GPU, on either device."""
     for start in range(0, len(steps), kernels.PARAMETERS_PER_LAUNCH):
         group = steps[start : start + kernels.PARAMETERS_PER_LAUNCH]
         absent = kernels.PARAMETERS_PER_LAUNCH - len(group)

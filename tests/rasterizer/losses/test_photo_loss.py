@@ -59,9 +59,3 @@ def test_without_a_gradient_the_value_is_the_same(device):
     weights = WEIGHTS | {"clipped": CLIPPED}
     image = light.to(device)
     assert torch.equal(photo_loss(image, *targets, **weights), photo_loss(image.requires_grad_(), *targets, **weights))
-
-
-def test_codes_of_another_size_are_refused(device):
-    light, codes, scale = clipped_photo(torch.float32, 0.0)
-    with pytest.raises(ValueError, match="expected uint8 or int16"):
-        photo_loss(light.to(device), code_tensor(codes[1:], device), scale, **WEIGHTS)

@@ -7,9 +7,8 @@ from scipy.special import sph_harm_y
 
 from sehdr_warp.rasterizer import HarmonicsGradients, spherical_harmonics
 from sehdr_warp.rasterizer.ops import harmonics
-from sehdr_warp.rasterizer.ops.step_updates import AdamStep, adam_steps, harmonics_adam_step
 
-from ..scenes import finite_differences, relative_error
+from ..rasterizer.scenes import finite_differences, relative_error
 
 GENERATOR_SEED = 7
 
@@ -117,53 +116,3 @@ def test_a_thread_for_each_coefficient_gives_the_same(device, degree, dtype):
     rest_gradient = factors.coefficient_gradients(leaves[0].detach()[:, 1:].contiguous(), 1)
     assert torch.allclose(rest_gradient, leaves[0].grad[:, 1:], rtol=1e-5, atol=1e-6)
     assert not rest_gradient[:, (degree + 1) ** 2 - 1 :].any()
-
-
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_adam_multiplies_the_factors_of_two_views_out(device, degree):
-    coefficients, means, camera = (tensor.float().to(device) for tensor in inputs())
-    positions = torch.stack([camera, -camera])
-    by_values = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(1)).to(device)
-    leaf = coefficients.clone().requires_grad_()
-    sum(
-        (spherical_harmonics(degree, leaf, means, p) * g).sum() for p, g in zip(positions, by_values, strict=True)
-    ).backward()
-    one, options = torch.ones((), device=device), {"rate": 0.01, "betas": (0.9, 0.999), "epsilon": 1e-15}
-    for start, part in ((0, slice(0, 1)), (1, slice(1, 16))):
-        plain, factored = (
-            [t[:, part].clone(), *(torch.zeros_like(t[:, part]) for _ in range(2))] for t in [coefficients] * 2
-        )
-        gradient, decays = leaf.grad[:, part].contiguous(), {k: options[k] for k in ("betas", "epsilon")}
-        adam_steps([AdamStep(plain[0], gradient, *plain[1:], one, options["rate"])], 0 * one, **decays)
-        gradients = HarmonicsGradients(by_values, positions, means, degree)
-        harmonics_adam_step(factored[0], start, gradients, *factored[1:], one, 0 * one, **options)
-        for a, b in zip(plain, factored, strict=True):
-            assert torch.allclose(a, b, rtol=1e-4, atol=1e-6)
-        first_gradient = factored[0].clone()
-        harmonics_adam_step(factored[0], start, gradients, *factored[1:], one, one, **options)
-        assert torch.equal(first_gradient, factored[0])
-
-
-@pytest.mark.parametrize("count", [60, 100])
-def test_parts_of_the_coefficients_step_in_turn(device, count):
-    generator = torch.Generator().manual_seed(1)
-    start, by_values, means = (
-        torch.randn(*shape, generator=generator).to(device) for shape in ((count, 15, 3), (1, count, 3), (count, 3))
-    )
-    gradients = HarmonicsGradients(by_values, torch.zeros(1, 3, device=device), means, 3)
-    options = {"rate": 0.01, "betas": (0.9, 0.999), "epsilon": 1e-15}
-    whole, parts = ([start.clone(), *(torch.zeros_like(start) for _ in range(2))] for _ in range(2))
-    never, changed = torch.zeros((), device=device), []
-    for number in (1.0, 2.0, 3.0, 4.0):
-        before, step = parts[0].clone(), torch.tensor(number, device=device)
-        harmonics_adam_step(parts[0], 1, gradients, *parts[1:], step, never, **options, update_interval=2)
-        changed.append((parts[0] != before).view(-1))
-    # Blocks take turns, whatever the number of Gaussians; two steps of each are those of all.
-    second = torch.arange(count * 45, device=device) // 1024 % 2 == 1
-    assert torch.equal(changed[0], second) and torch.equal(changed[1], ~second)
-    assert torch.equal(changed[2], second) and torch.equal(changed[3], ~second)
-    for number in (1.0, 2.0):
-        step = torch.tensor(number, device=device)
-        harmonics_adam_step(whole[0], 1, gradients, *whole[1:], step, never, **options)
-    for a, b in zip(whole, parts, strict=True):
-        assert torch.allclose(a, b, rtol=1e-5, atol=1e-7)

@@ -6,9 +6,8 @@ from itertools import product
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import HarmonicsGradients
+from sehdr_warp.rasterizer import HarmonicsGradients, spherical_harmonics
 from sehdr_warp.rasterizer.losses.ssim import image_distance
-from sehdr_warp.rasterizer.ops import step_updates
 from sehdr_warp.rasterizer.ops.step_updates import (
     AdamStep,
     adam_steps,
@@ -18,7 +17,11 @@ from sehdr_warp.rasterizer.ops.step_updates import (
     differentiate,
     finiteness_of,
     harmonics_adam_step,
+    nonfinite_by_kernel,
+    steps_by_kernel,
 )
+
+from .test_harmonics import inputs as harmonics_of
 
 OPTIONS = {"betas": (0.9, 0.999), "epsilon": 1e-15}
 COUNT, STRENGTH = 200_000, 0.5
@@ -34,7 +37,7 @@ def run_adam(step_function, parameter, gradients, rate, skip=()):
     return first, second, step
 
 
-@pytest.mark.parametrize("function", [adam_steps, step_updates._steps_by_kernel])
+@pytest.mark.parametrize("function", [adam_steps, steps_by_kernel])
 @pytest.mark.parametrize("scale", [1.0, 1e-12, 1e12])
 def test_many_steps_are_torchs_in_float64(device, scale, function):
     generator = torch.Generator().manual_seed(0)
@@ -53,7 +56,7 @@ def test_many_steps_are_torchs_in_float64(device, scale, function):
         assert ((moment.cpu() - true_moment).norm() / true_moment.norm()) < 1e-6
 
 
-@pytest.mark.parametrize("function", [adam_steps, step_updates._steps_by_kernel])
+@pytest.mark.parametrize("function", [adam_steps, steps_by_kernel])
 def test_a_skipped_step_changes_nothing(device, function):
     gradients = [torch.full((5,), value, device=device) for value in (1.0, float("nan"), -0.5)]
     with_skip, without = torch.zeros(5, device=device), torch.zeros(5, device=device)
@@ -64,7 +67,7 @@ def test_a_skipped_step_changes_nothing(device, function):
     assert all(moment.isfinite().all() for moment in moments)
 
 
-@pytest.mark.parametrize("function", [adam_steps, step_updates._steps_by_kernel])
+@pytest.mark.parametrize("function", [adam_steps, steps_by_kernel])
 def test_many_parameters_step_as_each_by_itself(device, function):
     generator = torch.Generator().manual_seed(2)
     one = torch.ones((), device=device)
@@ -82,7 +85,7 @@ def test_many_parameters_step_as_each_by_itself(device, function):
         assert all(torch.equal(a, b) for a, b in zip(together[:4], alone[:4], strict=True))
 
 
-@pytest.mark.parametrize("function", [finiteness_of, step_updates._nonfinite_by_kernel])
+@pytest.mark.parametrize("function", [finiteness_of, nonfinite_by_kernel])
 @pytest.mark.parametrize("value", [math.inf, math.nan, 1e20])  # The square of the last is infinite.
 @pytest.mark.parametrize("place", [None, 0, 9])
 def test_one_number_that_is_not_finite_shows_in_the_result(device, place, value, function):
@@ -112,7 +115,7 @@ def test_rows_that_do_not_count_are_left_alone(device):
         for tensor, width in ((values, 4), (other, 0))
     ]
     active_count = torch.tensor([5], dtype=torch.int32, device=device)
-    step_updates._steps_by_kernel(steps, 0 * one, *OPTIONS.values(), active_count)
+    steps_by_kernel(steps, 0 * one, *OPTIONS.values(), active_count)
     assert (values[:5] == values[0, 0]).all() and values[0, 0] < 0 and not values[5].any() and other.all()
     moments = (torch.zeros(6, 15, 3, device=device) for _ in range(3))
     ones = torch.ones(6, 3, device=device)
@@ -122,14 +125,9 @@ def test_rows_that_do_not_count_are_left_alone(device):
     assert parameter[:5, 1].all() and not parameter[5].any() and not state[0][5].any()
 
 
-def test_no_numbers_are_no_work_and_another_layout_is_refused(device):
+def test_no_numbers_are_no_work(device):
     empty, one = torch.zeros(0, 3, device=device), torch.ones((), device=device)
     adam_steps([AdamStep(empty, empty, empty, empty, one, one)], one, **OPTIONS)
-    square = torch.zeros(4, 4, device=device)
-    with pytest.raises(ValueError, match="gradient is torch.float32"):
-        adam_steps([AdamStep(square, torch.zeros(3, device=device), square, square, one, 0.1)], one, **OPTIONS)
-    with pytest.raises(ValueError, match="second moment is torch.float64"):
-        adam_steps([AdamStep(square, square, square, square.double(), one, 0.1)], one, **OPTIONS)
 
 
 def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
@@ -145,6 +143,57 @@ def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):
             flags = decide_step(torch.tensor(loss, device=device), inputs, overflow, tally, counted)
             assert [float(value) for value in flags] == [skipped, not skipped]
         assert tally.tolist() == [4 + 2 * nonfinite, 9, 2 + bool(incomplete)]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_factors_of_two_views_are_multiplied_out_as_torchs_adam_steps_in_float64(device, degree):
+    coefficients, means, camera = harmonics_of()
+    positions, upstream = torch.stack([camera, -camera]), torch.linspace(-1, 1, 120, dtype=torch.float64).view(2, 20, 3)
+    truth = torch.nn.Parameter(coefficients)
+    optimizer = torch.optim.Adam([truth], lr=0.01, eps=1e-15)
+    gradients = HarmonicsGradients(*(t.float().to(device) for t in (upstream, positions, means)), degree)
+    parts = [(0, coefficients[:, :1]), (1, coefficients[:, 1:])]
+    states = [
+        (k, part.float().to(device).contiguous(), *torch.zeros(2, *part.shape, device=device)) for k, part in parts
+    ]
+    one = torch.ones((), device=device)
+    for number in (1, 2, 3):
+        optimizer.zero_grad()
+        for position, by_value in zip(positions, upstream, strict=True):
+            (spherical_harmonics(degree, truth, means, position) * by_value).sum().backward()
+        optimizer.step()
+        for start, parameter, *moments in states:
+            harmonics_adam_step(parameter, start, gradients, *moments, number * one, 0 * one, rate=0.01, **OPTIONS)
+            before = parameter.clone()
+            harmonics_adam_step(parameter, start, gradients, *moments, number * one, one, rate=0.01, **OPTIONS)
+            assert torch.equal(parameter, before)
+    expected = truth, *(optimizer.state[truth][name] for name in ("exp_avg", "exp_avg_sq"))
+    for mine, true in zip(zip(*(state[1:] for state in states), strict=True), expected, strict=True):
+        torch.testing.assert_close(torch.cat(mine, 1).cpu().double(), true.detach(), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("count", [60, 100])
+def test_parts_of_the_coefficients_step_in_turn(device, count):
+    generator = torch.Generator().manual_seed(1)
+    start, by_values, means = (
+        torch.randn(*shape, generator=generator).to(device) for shape in ((count, 15, 3), (1, count, 3), (count, 3))
+    )
+    gradients = HarmonicsGradients(by_values, torch.zeros(1, 3, device=device), means, 3)
+    whole, parts = ([start.clone(), *(torch.zeros_like(start) for _ in range(2))] for _ in range(2))
+    never, changed = torch.zeros((), device=device), []
+    for number in (1.0, 2.0, 3.0, 4.0):
+        before, step = parts[0].clone(), torch.tensor(number, device=device)
+        harmonics_adam_step(parts[0], 1, gradients, *parts[1:], step, never, rate=0.01, **OPTIONS, update_interval=2)
+        changed.append((parts[0] != before).view(-1))
+    # Blocks take turns, whatever the number of Gaussians; two steps of each are those of all.
+    second = torch.arange(count * 45, device=device) // 1024 % 2 == 1
+    assert torch.equal(changed[0], second) and torch.equal(changed[1], ~second)
+    assert torch.equal(changed[2], second) and torch.equal(changed[3], ~second)
+    for number in (1.0, 2.0):
+        step = torch.tensor(number, device=device)
+        harmonics_adam_step(whole[0], 1, gradients, *whole[1:], step, never, rate=0.01, **OPTIONS)
+    for a, b in zip(whole, parts, strict=True):
+        assert torch.allclose(a, b, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("usable", [0.0, 1.0])

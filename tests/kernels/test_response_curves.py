@@ -9,7 +9,7 @@ from sehdr_warp.rasterizer.ops.response_curves import encode_with_slope
 from sehdr_warp.response import response_by_name, response_names
 from sehdr_warp.response.curve import EXTENSION_SLOPE
 
-from ..scenes import relative_error
+from ..rasterizer.scenes import relative_error
 
 NAMES = [*response_names(), "gamma-3"]
 

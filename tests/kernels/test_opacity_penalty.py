@@ -1,13 +1,15 @@
 """The penalty on opacities: its kernels against torch, and finite differences."""
 
+import math
+
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.losses.opacity_penalty import _OpacityPenalty, opacity_penalty
+from sehdr_warp.rasterizer.losses.opacity_penalty import opacity_penalty, penalty_by_kernels
 
-from ..scenes import finite_differences, relative_error
+from ..rasterizer.scenes import finite_differences, relative_error
 
-PENALTIES = [opacity_penalty, _OpacityPenalty.apply]
+PENALTIES = [opacity_penalty, penalty_by_kernels]
 
 
 def opacities_in_view(count, device, dtype=torch.float32):
@@ -46,3 +48,13 @@ def test_the_gradient_of_the_penalty_is_that_of_finite_differences(device, funct
     numeric = finite_differences(lambda values: 2 * function(values, extents, moments, 0.7, None), [opacities], 0)
     (2 * function(opacities.requires_grad_(), extents, moments, 0.7, None)).backward()
     assert relative_error(opacities.grad, numeric) < 1e-9
+
+
+@pytest.mark.parametrize("function", PENALTIES)
+def test_gaussians_that_do_not_count_may_have_any_opacity_and_none_are_no_penalty(device, function):
+    opacities = torch.tensor([0.5, math.nan, math.inf], device=device, requires_grad=True)
+    extents = torch.tensor([[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]], device=device)
+    penalty = function(opacities, extents, None, 1.5, None)
+    penalty.backward()
+    assert penalty.item() == 0.25 and opacities.grad.tolist() == [0.5, 0.0, 0.0]
+    assert function(opacities[:0], extents[:0], None, 1.5, None).item() == 0.0

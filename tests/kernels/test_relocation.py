@@ -1,6 +1,7 @@
 """Relocation of Gaussians on the device: shares of opacity by equation 9, and rows in their slots."""
 
 import math
+from fractions import Fraction
 
 import pytest
 import torch
@@ -11,7 +12,6 @@ from sehdr_warp.rasterizer.ops.relocation import (
     copy_rows,
     count_copies,
     number_slots,
-    relocation_sums,
     scale_rows,
     share_opacities,
 )
@@ -25,8 +25,13 @@ def test_shares_are_those_of_equation_9(device):
     share_opacities(logits, log_scales, copies, least=0.005)
     parts = (copies + 1).clamp_max(MOST_COPIES).double()
     part = 1 - (1 - opacities.double()) ** (1 / parts)
-    powers = part[:, None] ** torch.arange(1, MOST_COPIES + 1, device=device)
-    total = (relocation_sums(logits.device)[parts.long() - 1] * powers).sum(1)
+    total = torch.zeros_like(part)
+    for row, (each, count) in enumerate(zip(part.tolist(), parts.long().tolist(), strict=True)):
+        terms = [(i, k) for i in range(1, count + 1) for k in range(i)]
+        exact = (
+            Fraction(each) ** (k + 1) * math.comb(i - 1, k) * (-1) ** k / Fraction(math.sqrt(k + 1)) for i, k in terms
+        )
+        total[row] = float(sum(exact))
     shrink = (opacities.double() / total).clamp(1e-3, 1)
     expected = torch.where(copies > 0, part.clamp(0.005, 1 - 1e-6), opacities.double())
     torch.testing.assert_close(torch.sigmoid(logits.double()), expected, rtol=1e-5, atol=0)
