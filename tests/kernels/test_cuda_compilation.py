@@ -1,6 +1,7 @@
 """Compile kernels for CUDA, without a GPU: machines of continuous integration have none.
 
-Warp comes with NVIDIA's compiler. What the kernels compute on a GPU is tested by the files beside this one where there is one.
+Warp comes with NVIDIA's compiler. What the kernels compute is tested by the files beside this one, on a GPU if there is
+one.
 """
 
 from collections.abc import Callable
