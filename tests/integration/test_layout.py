@@ -16,7 +16,7 @@ TOPICS = {
         "bad_input", "confidence", "deterministic", "divergence", "fields", "nodes", "out_of_memory", "reserved_rows",
         "resume", "rivals", "units",
     },
-    "viewer": {"page", "proxies", "scene_page"},
+    "viewer": {"proxies"},
 }  # fmt: skip
 """Tests of what several modules of a package do together. Prefer a module's name."""
 

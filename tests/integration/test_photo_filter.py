@@ -12,9 +12,9 @@ from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.merged_scene import merge_scenes
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.splats import read_gaussians, write_gaussians
+from tests.output.helpers import splats
 from tests.splats.samples import LOSSY_SUFFIXES
 
-from ..output.export.test_splat_edits import splats
 from ..output.helpers import Entry, camera
 
 VIEW = camera(96, 72)

@@ -1,13 +1,22 @@
 """Pictures and cameras that the output tests share."""
 
+import os
+import shutil
+import subprocess
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
+from sehdr_warp.model.light_shapes import LightShape
+from sehdr_warp.model.lights import Light, ReceivedLight
 from sehdr_warp.model.renders import RenderedView
-from sehdr_warp.scene import Camera, look_at
+from sehdr_warp.runs.run import load_splats
+from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.scene.images.hdr_files import read_exr_channels
+from sehdr_warp.splats import GaussianArrays, write_gaussians
 
 
 def radiance(height=24, width=32, seed=0):
@@ -109,3 +118,99 @@ def read_exr(path):
     channels, header = read_exr_channels(path)
     names = tuple(sorted(channels, key=lambda name: ("RGBA".find(name) % 5, name)))
     return np.stack([channels[name] for name in names], axis=2), names, header
+
+
+def splats(means, opacities, scale=0.1):
+    """Grey Gaussians of display colors."""
+    count = len(means)
+    opacities = np.asarray(opacities, np.float64)
+    return GaussianArrays(
+        means=np.asarray(means, np.float32),
+        log_scales=np.full((count, 3), np.log(scale), np.float32),
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
+        harmonics=np.full((count, 1, 3), 0.5, np.float32),
+        color_model="display",
+        base_time=1.0,
+    )
+
+
+def run_of(tmp_path, gaussians, name="s"):
+    write_gaussians(tmp_path / f"{name}.ply", gaussians)
+    run = load_splats(tmp_path / f"{name}.ply")
+    run.cameras = tuple(Entry(str(i), "train", camera(position=(i - 1, 0, -6))) for i in range(3))
+    return run
+
+
+def arc(count, degrees, radius=3.0, height=-0.5):
+    angles = np.radians(np.linspace(-degrees / 2, degrees / 2, count, endpoint=degrees < 360))
+    return [camera(position=(radius * np.sin(a), height, -radius * np.cos(a))) for a in angles]
+
+
+def sees(view, point):
+    x, y, z, _ = view.world_to_camera @ np.append(point, 1)
+    return view.fx * x / z + view.cx, view.fy * y / z + view.cy
+
+
+AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float32)
+LIGHT = np.array([[9, 1, 1], [1, 9, 9], [1, 9, 1], [9, 1, 9], [1, 1, 9], [9, 9, 1]], dtype=np.float32)
+
+
+def lamps(width=0.15):
+    """A lamp on each of the six axes, each of a color of its own."""
+    shape = np.full((6, 3), np.log(5 * width), np.float32), np.tile(np.float32([1, 0, 0, 0]), (6, 1))
+    harmonics = LIGHT[:, None] / 0.28209479
+    return GaussianArrays(5 * AXES, *shape, np.full(6, 5, np.float32), harmonics, "linear", 0.5)
+
+
+PANEL = LightShape("rect", np.array([1.0, 0.5, 2.0]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (0.4, 0.2))
+BALL = LightShape("sphere", np.array([0.0, 0.0, 3.0]), np.eye(3), (0.3, 0.3))
+LIGHTS = [
+    Light(PANEL, np.array([8.0, 4.0, 2.0]), np.ones(3), 0.4, 0.5, torch.tensor([0])),
+    Light(BALL, np.array([3.0, 3.0, 3.0]), np.ones(3), None, 0.2, torch.tensor([1, 2])),
+]
+
+
+def received(place):
+    """Return what reaches a place: the first Gaussian of each light gives all of its light."""
+    angles, light = torch.zeros(6, dtype=torch.float64), torch.zeros(6, 3, dtype=torch.float64)
+    for each in LIGHTS:
+        angles[each.members[0]] = each.shape.solid_angle(place)
+        light[each.members[0]] = torch.from_numpy(each.radiance * each.shape.solid_angle(place))
+    return ReceivedLight(angles, angles, light)
+
+
+METRICS = [
+    {"iteration": 100, "seconds": 1.5, "split": "test", "psnr_ldr": 20.0, "psnr_mu": 18.0},
+    {"iteration": 200, "seconds": 3.0, "split": "test", "psnr_ldr": 26.0, "psnr_mu": 25.5},
+]
+
+
+def make(folder, *, truth=True, splits=("train", "test", "test"), metrics=METRICS):
+    run = AnalyticRun([(f"v_{i}", split) for i, split in enumerate(splits)])
+    run.metrics = lambda: [{"iteration": 1}, *(metrics or ())]
+    views = []
+    for entry in run.cameras:
+        hdr = run.render(entry.camera).hdr.numpy()
+        image = run.response.encode(hdr * entry.exposure_time).astype(np.float32)
+        known = {"hdr": hdr} if truth else {}
+        views.append(View(entry.name, codes_of(image, 16), entry.camera, entry.exposure_time, entry.split, **known))
+    return run, Scene("sky", "photos", tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+
+
+def validate(text):
+    """HTML that no parser, and none of the validators that are here, complains about."""
+    pytest.importorskip("html5lib").HTMLParser(strict=True).parse(text)
+    folders = [
+        Path(folder, "vnu-jar/build/dist/vnu.jar") for folder in os.environ.get("NODE_PATH", "").split(os.pathsep)
+    ]
+    commands = [["tidy", "-q", "-e"], *(["java", "-jar", str(jar), "-"] for jar in folders if jar.is_file())]
+    for command in (command for command in commands if shutil.which(command[0])):
+        checked = subprocess.run(command, input=text, capture_output=True, text=True)
+        assert checked.returncode == 0 and not checked.stderr, checked.stderr
+
+
+def smooth_run():
+    run = AnalyticRun()
+    run.gain = 3.0
+    return run, [entry.camera.resized(97, 64) for entry in run.cameras]

@@ -20,8 +20,7 @@ from sehdr_warp.output.render_views import render_views
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.scene.images.hdr_files import read_hdr
 
-from .export.test_splat_edits import run_of, splats
-from .helpers import AnalyticRun
+from .helpers import AnalyticRun, run_of, splats
 
 SIZE, FRAMES, RADIUS = (320, 180), (0, 2), 0.02
 NORMALS = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (0.6, 0.64, 0.48)]

@@ -17,7 +17,7 @@ from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.splats.arrays import HARMONIC_0
 
-from .export.test_splat_edits import run_of, splats
+from .helpers import run_of, splats
 
 
 @pytest.fixture

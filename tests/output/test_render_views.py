@@ -1,22 +1,18 @@
 import json
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.output.cameras.paths import interpolate, orbit
-from sehdr_warp.output.cameras.scene_cameras import common_focus
 from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.images.display import display_gain
 from sehdr_warp.output.render_views import render_views
 from sehdr_warp.own_files import LIST
-from sehdr_warp.scene import Camera, load_cameras
 from sehdr_warp.scene.exposure.compensation import ExposureCompensation
 from sehdr_warp.scene.file_names import safe_names
 
-from .helpers import AnalyticRun, Entry, camera, read_exr
+from .helpers import AnalyticRun, camera, read_exr
 
 
 def tree(folder):
@@ -166,119 +162,6 @@ def test_names_are_safe_and_different():
     assert len({name.casefold() for name in safe}) == len(safe)
 
 
-def arc(count, degrees, radius=3.0, height=-0.5):
-    angles = np.radians(np.linspace(-degrees / 2, degrees / 2, count, endpoint=degrees < 360))
-    return [camera(position=(radius * np.sin(a), height, -radius * np.cos(a))) for a in angles]
-
-
-def sees(view, point):
-    x, y, z, _ = view.world_to_camera @ np.append(point, 1)
-    return view.fx * x / z + view.cx, view.fy * y / z + view.cy
-
-
-@pytest.mark.parametrize("degrees", [60, 360])
-def test_orbit_looks_at_the_focus_smoothly(degrees):
-    camera_path = arc(12, degrees)
-    path = orbit(camera_path, 48, 1)
-    positions = np.stack([view.position for view in path])
-    for view in path:
-        np.testing.assert_allclose(sees(view, np.zeros(3)), (view.cx, view.cy), atol=1e-6)
-        assert view.world_to_camera[1, :3] @ [0, 1, 0] > 0.9
-        np.testing.assert_allclose(np.linalg.norm(view.position), np.linalg.norm(camera_path[0].position), rtol=1e-6)
-    steps = np.linalg.norm(np.diff(positions, axis=0, append=positions[:1]), axis=1)
-    assert steps.max() < 4 / len(path) * np.ptp(positions, axis=0).max()
-    azimuth = np.degrees(np.arctan2(positions[:, 0], -positions[:, 2]))
-    assert np.ptp(azimuth) > 300 if degrees == 360 else np.abs(azimuth).max() < 30
-
-
-def test_orbit_of_parallel_cameras_uses_the_depth_seen():
-    run = AnalyticRun()
-    run.cameras = [
-        Entry(str(i), "train", camera(position=(x, 0, -3), target=(x, 0, 0))) for i, x in enumerate((0, 0.2, 0.4))
-    ]
-    views = select_cameras(run, "orbit", count=8)
-    assert [name for name, _ in views] == [f"orbit_{i:03d}" for i in range(8)]
-    for _, view in views:  # AnalyticRun's depth is 2 everywhere: the focus lies at z = -1.
-        np.testing.assert_allclose(sees(view, (0.2, 0, -1)), (view.cx, view.cy), atol=0.1)
-
-
-def test_interpolation_passes_through_its_cameras():
-    camera_path = arc(5, 90)
-    path = interpolate(camera_path, 41)
-    assert len(path) == 41
-    for i, view in enumerate(camera_path):
-        np.testing.assert_allclose(path[10 * i].world_to_camera, view.world_to_camera, atol=1e-6)
-    turns = [np.linalg.norm(a.world_to_camera - b.world_to_camera) for a, b in pairwise(path)]
-    assert max(turns) < 1.5 * min(turns)
-    repeated = interpolate([camera_path[0], camera_path[0], camera_path[1]], 3)
-    np.testing.assert_allclose(repeated[2].world_to_camera, camera_path[1].world_to_camera, atol=1e-9)
-    assert len(interpolate(camera_path[:1], 4)) == 4
-
-
-def test_paths_need_cameras(tmp_path):
-    with pytest.raises(SehdrError, match=r"no training views.*file of cameras"):
-        interpolate([], 3)
-    for choice in ("test", "all", "orbit"):  # As of a file of Gaussians without a file of cameras beside it
-        with pytest.raises(SehdrError, match=rf"no cameras of its own, and {choice} needs them; .*which export writes"):
-            render_views(AnalyticRun([]), tmp_path / "out", cameras=choice)
-    with pytest.raises(SehdrError, match="no cameras, and so no view 'r_0'"):
-        render_views(AnalyticRun([]), tmp_path / "out", camera="r_0")
-    with pytest.raises(SehdrError, match="path cannot have 0 views"):
-        orbit(arc(3, 30), 0, 1)
-
-
-def test_aovs_are_parts_of_their_own(tmp_path):
-    OpenEXR = pytest.importorskip("OpenEXR")
-    run = AnalyticRun()
-    render_views(run, tmp_path, aovs="all", axes="scene")
-    view, rendered = run.cameras[3].camera, run.render(run.cameras[3].camera)
-    with OpenEXR.File(str(tmp_path / "hdr" / "t_0.exr"), separate_channels=True) as file:
-        headers = {part.name(): dict(part.header) for part in file.parts}
-        pixels = {name: channel.pixels for part in file.parts for name, channel in part.channels.items()}
-    assert {pixels[f"N.{axis}"].dtype for axis in "XYZ"} == {np.dtype(np.float16)}
-    assert list(headers) == ["rgba", "depth", "position", "normals", "alpha", "confidence", "clipped"]
-    assert headers.pop("rgba")["colorInteropID"] == "lin_rec709_scene"
-    assert all(h["colorInteropID"] == "data" and "chromaticities" not in h for h in headers.values())
-    points = np.stack([pixels[f"position.{axis}"] for axis in "XYZ"], 2)
-    np.testing.assert_allclose(np.linalg.norm(points - view.position, axis=2), pixels["distance.Z"], rtol=1e-5)
-    np.testing.assert_allclose((points - view.position) @ view.world_to_camera[2, :3], rendered.depth, rtol=1e-5)
-    # A plane across the view, nearly: its normal is against the axis.
-    normal = np.stack([pixels[f"N.{axis}"] for axis in "XYZ"], 2)[1:-1, 1:-1]
-    np.testing.assert_allclose(normal @ -view.world_to_camera[2, :3], 1, atol=2e-3)
-    assert (pixels["clipped"] == 0.25).all()
-    run.confident = False
-    for name in ("clipped", "confidence"):
-        with pytest.raises(SehdrError, match=f"AOV {name} was not measured"):
-            render_views(run, tmp_path, aovs=name, overwrite=True)
-    for aovs, words in (("depht", "did you mean depth"), ("alpha,alpha", "named twice")):
-        with pytest.raises(SehdrError, match=words):
-            render_views(run, tmp_path, aovs=aovs, overwrite=True)
-
-
-def test_cameras_go_to_usd_and_come_back(tmp_path):
-    pytest.importorskip("pxr")
-    run = AnalyticRun([("a 1", "train"), ("a_1", "train"), ("2", "train")])
-    render_views(run, tmp_path, cameras="train", axes="scene")
-    read = load_cameras(tmp_path / "cameras.usda")
-    assert [name for name, _ in read] == ["a_1", "a_1_2", "_2"]
-    for entry, (_, camera_) in zip(run.cameras, read, strict=True):
-        np.testing.assert_allclose(camera_.world_to_camera, entry.camera.world_to_camera, atol=1e-9)
-        np.testing.assert_allclose(camera_.intrinsics, entry.camera.intrinsics, rtol=1e-6)
-        assert (camera_.width, camera_.height) == (entry.camera.width, entry.camera.height)
-
-
-def test_size_keeps_the_vertical_field_of_view(tmp_path):
-    run = AnalyticRun()
-    render_views(run, tmp_path, size="64x36")
-    camera_ = Camera.from_dict(json.loads(read_exr(tmp_path / "hdr" / "t_0.exr")[2]["sehdr:camera"]))
-    camera_path = run.cameras[3].camera
-    assert (camera_.width, camera_.height) == (64, 36) and camera_.fy / 36 == camera_path.fy / camera_path.height
-    assert (camera_.cx - 32) / camera_.fx == pytest.approx((camera_path.cx - camera_path.width / 2) / camera_path.fx)
-    for size in ("64", "5000000x4", "0x9", "axb", "99999x99999"):
-        with pytest.raises(SehdrError, match="such as 1920x1080"):
-            render_views(run, tmp_path / "other", size=size)
-
-
 def test_cameras_that_see_nothing_are_warned_of(tmp_path, logged, monkeypatch):
     run = AnalyticRun()
     rendered = run.render
@@ -291,28 +174,6 @@ def test_cameras_that_see_nothing_are_warned_of(tmp_path, logged, monkeypatch):
     monkeypatch.setattr(run, "render", nothing)
     render_views(run, tmp_path)
     assert any("2 of 2 cameras (t_0, t_1) see nothing" in line for line in logged)
-
-
-def test_common_focus_is_where_the_axes_meet():
-    np.testing.assert_allclose(common_focus(arc(5, 60)), 0, atol=1e-9)
-    parallel = [camera(position=(x, 0, -3), target=(x, 0, 0)) for x in (0, 0.1, 0.2)]
-    assert common_focus(parallel) is None
-    away = [camera(position=(x, 0, -3), target=(3 * x, 0, -9)) for x in (-1.0, -0.5, 0.5, 1.0)]
-    assert common_focus(away) is None
-
-
-def test_orbit_follows_an_arc_that_goes_up_and_down():
-    # A hand-held walk over a mound and around a corner: higher and farther away in the middle.
-    angles = np.radians(np.linspace(-34, 34, 10))
-    heights, distances = 0.6 - 9 * (angles - 0.1) ** 2 / 4, 12 - 5 * angles**2
-    camera_path = [
-        camera(position=(d * np.sin(a), -h, -d * np.cos(a))) for a, h, d in zip(angles, heights, distances, strict=True)
-    ]
-    for view in orbit(camera_path, 48, 1):
-        x, y, z = view.position
-        near = np.argsort(np.abs(angles - np.arctan2(x, -z)))[:2]
-        assert heights[near].min() - 0.05 < -y < heights[near].max() + 0.05
-        assert distances[near].min() - 0.1 < np.hypot(x, z) < distances[near].max() + 0.1
 
 
 def test_stops_count_from_the_median_exposure_of_photos_that_differ(tmp_path, logged):

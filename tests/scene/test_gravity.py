@@ -1,6 +1,7 @@
 """Up by GPS, by vertical lines and by poses: of rendered rooms, whose Z is up, and of flights with places in EXIF."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,14 +10,13 @@ from PIL import Image
 from scipy.ndimage import rotate
 from scipy.spatial.transform import Rotation
 
+from sehdr_warp.output.cameras.paths import orbit
 from sehdr_warp.scene import Camera, Scene, View, load_scene, look_at
-from sehdr_warp.scene.gravity import UpDirection, find_up, looks_down, up_direction, up_from_lines
+from sehdr_warp.scene.gravity import UpDirection, find_up, is_pitch_known, looks_down, up_direction, up_from_lines
+
+from .walks import degrees, photos, ring
 
 UP = np.array([0.0, 0, 1])
-
-
-def degrees(a, b=UP):
-    return np.degrees(np.arccos(np.clip(a @ b, -1, 1)))
 
 
 def scene(views):
@@ -152,3 +152,52 @@ def test_phone_photos_stored_on_their_side_stand_upright(tmp_path):
     assert degrees(up_direction([view.camera for view in scene.views])) > 80
     assert degrees(find_up(scene).direction) < 2
     assert not looks_down([view.camera for view in scene.views], UP)
+
+
+@pytest.mark.parametrize(
+    "name, positions, target, options",
+    [
+        ("a walk around, looking down", ring(40, 4, 3), (0, 0, 0), {}),
+        ("hands", ring(60, 4, 2), (0, 0, 0), {"roll": 3}),
+        ("half an arc, looking down", ring(30, 4, 2, span=150), (0, 0, 0), {"roll": 2}),
+        ("some turned by a quarter", ring(60, 4, 1), (0, 0, 0), {"roll": 2, "turned": 3}),
+    ],
+)
+def test_up_is_within_three_degrees(name, positions, target, options):
+    turn = Rotation.from_euler("xyz", [40, 70, 110], degrees=True).as_matrix()
+    up = turn @ [0, 1, 0]
+    cameras = photos(up, positions @ turn.T, turn @ np.array(target), **options)
+    assert degrees(up_direction(cameras), up) < 3, name
+
+
+@pytest.mark.parametrize("room", ["room", "lamps", "glass", "study", "sunlit"])
+def test_rooms_whose_cameras_turn_are_upright_within_a_degree(room):
+    cameras = [view.camera for view in load_scene(f"embedded:{room}", max_size=32, response="srgb").train_views]
+    direction = up_direction(cameras)
+    assert degrees(direction, np.array([0, 0, 1])) < 1 and is_pitch_known(cameras, direction)
+
+
+def test_up_of_a_flight_that_looks_straight_down():
+    positions = [(x, 30.0, z) for x in range(4) for z in range(4)]
+    cameras = []
+    for index, position in enumerate(positions):
+        heading = math.radians(90 * (index % 4))
+        ahead = (math.cos(heading), 0, math.sin(heading))
+        cameras.append(Camera(32, 24, 40, 40, 16, 12, look_at(position, np.array(position) - (0, 9, 0), up=ahead)))
+    assert degrees(up_direction(cameras), np.array([0, 1, 0])) < 1
+    # So an orbit looks at the ground from their height.
+    for each in orbit(cameras, 5, 30.0):
+        assert each.position[1] == pytest.approx(30, abs=1) and each.world_to_camera[2, 1] < -0.9
+
+
+def test_up_of_a_flight_to_and_fro():
+    """The level axes of all pictures lie along one line, which says nothing of what is up."""
+    random, cameras = np.random.default_rng(0), []
+    for index in range(20):
+        position = np.array([index % 5, 20.0, index // 5])
+        ahead = (0, 0, 1 if index // 5 % 2 else -1)
+        target = position - (*random.normal(0, 0.08, 1), 1, *random.normal(0, 0.08, 1))
+        cameras.append(Camera(32, 24, 40, 40, 16, 12, look_at(position, target, up=ahead)))
+    assert degrees(up_direction(cameras), np.array([0, 1, 0])) < 3
+    for each in orbit(cameras, 5, 20.0):
+        assert each.position[1] == pytest.approx(20, abs=1) and each.world_to_camera[2, 1] < -0.9

@@ -8,9 +8,8 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, write_gaussians
-from tests.splats.samples import gaussians, rewrite
 
-from .samples import node, package
+from .samples import gaussians, node, package, rewrite
 
 VALIDATE = """
 const validator = require('gltf-validator'), file = require('fs').readFileSync(process.argv[1]);

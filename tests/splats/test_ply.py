@@ -11,9 +11,8 @@ from plyfile import PlyData, PlyElement
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, write_gaussians
 from sehdr_warp.splats.arrays import HARMONIC_0
-from tests.splats.samples import gaussians
 
-from .samples import DEGREE_0_NAMES, node, package, write_ply
+from .samples import DEGREE_0_NAMES, gaussians, node, package, write_ply
 
 
 def test_ply_has_the_names_and_order_of_the_reference_release(tmp_path):

@@ -10,9 +10,8 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.splats import read_gaussians, write_gaussians
-from tests.splats.samples import gaussians
 
-from .samples import natural
+from .samples import gaussians, natural
 
 
 def as_version_4(data, degree, extension=b""):

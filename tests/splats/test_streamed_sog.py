@@ -9,7 +9,8 @@ import pytest
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, streamed_sog, write_gaussians
 from tests.make_scenes import edited_json
-from tests.splats.samples import assert_alike, natural, package
+
+from .samples import assert_alike, natural, package
 
 
 @pytest.fixture

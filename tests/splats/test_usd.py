@@ -8,7 +8,8 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.splats import read_gaussians, write_gaussians
-from tests.splats.samples import gaussians
+
+from .samples import gaussians
 
 
 def test_usd_states_the_extent_of_what_is_drawn(tmp_path):

@@ -10,9 +10,9 @@ import torch
 
 from sehdr_warp.viewer.server import Server, Viewer
 from sehdr_warp.viewer.viewer_scene import ViewerScene
+from tests.output.helpers import make
 
 from ..output.helpers import AnalyticRun
-from ..output.report.test_write import make
 
 
 @contextmanager

@@ -16,8 +16,8 @@ from sehdr_warp.scene import Camera, View
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.viewer.server import Viewer
 from sehdr_warp.viewer.viewer_scene import ViewerScene
+from tests.output.helpers import run_of, splats
 
-from ..output.export.test_splat_edits import run_of, splats
 from .browser import browser, page_of
 from .conftest import serving
 from .test_page import until

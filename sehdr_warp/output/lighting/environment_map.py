@@ -34,7 +34,7 @@ _NEAR = 0.02  # Spread of the cameras: surfaces that near in most directions mea
 _LARGEST = 1 << 15  # Pixels across
 _WHOLE = 99.5  # Covered per cent from which nothing is said of the rest
 _FINEST = {"latlong": 4096, "cube": 1024}  # Smaller maps are averaged from renders of at most so many pixels across
-_MOST_PIXELS = 1 << 21  # Pixels that are rendered at once
+BAND_PIXELS = 1 << 21  # Pixels that are rendered at once
 _COARSE, _DARKEST = 128, 1e-9  # Inpainting: columns of the coarse map, and the least light
 _SURROUNDINGS, _MOST_OVER = 0.1, 32.0  # Inpainting: radians, and the most times the mean around that counts
 # The nearest axes of a cube's faces in OpenEXR's order (+X -X +Y -Y +Z -Z): to the right, down, and out.
@@ -224,7 +224,7 @@ def render_map(
     finer = int(np.clip(np.ceil(angle * focal), 1, max(1, _FINEST[layout] // size)))
     rows = size // 2 if layout == "latlong" else 6 * size
     # In bands, because the fine pixels of a whole map would take a gigabyte.
-    step = max(1, _MOST_PIXELS // (size * finer * finer))
+    step = max(1, BAND_PIXELS // (size * finer * finer))
     options |= {"focal_length": focal or 1 / angle, "pixel_angle": angle / finer}
     bands = []
     for start in range(0, rows, step):

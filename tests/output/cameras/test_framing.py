@@ -14,8 +14,7 @@ from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.splats import write_gaussians
 
-from ..export.test_splat_edits import splats
-from ..helpers import AnalyticRun, Entry, camera
+from ..helpers import AnalyticRun, Entry, camera, splats
 
 
 def around(count, radius, span=360, fov=30):

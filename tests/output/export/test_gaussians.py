@@ -8,9 +8,7 @@ import torch
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of, gaussians_of
 from sehdr_warp.model.paged_field import PagedField
-from sehdr_warp.output.commands import Render, ViewFileOptions, run_render
-from sehdr_warp.output.export.commands import Convert, Export, run_convert, run_export
-from sehdr_warp.output.export.gaussians import _splat_renderer, export
+from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.images.display import display_gain, encode_srgb
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import Splats, load_splats
@@ -37,14 +35,8 @@ def test_suffix_and_kind_decide(tmp_path, run, logged):
     assert sum(line.startswith("kept:") for line in logged) == 3
 
 
-def test_a_wrong_suffix_is_told_all_that_export_writes(tmp_path):
-    with pytest.raises(InputError, match=r"scene: is not a splat file; use one of \.ply .* \.glb .* \.html$"):
-        run_export(Export(run=tmp_path, out=tmp_path / "scene"))
-    with pytest.raises(InputError, match=r"holds 8 bits .* \.html$"):
-        run_export(Export(run=tmp_path, out=tmp_path / "scene.splat"))
-
-
-def test_exposure_of_display_colors(tmp_path, run, logged):
+def test_exposure_of_display_colors(tmp_path, run, logged, device):
+    run.field.to(device)
     export(run, tmp_path / "a.ply")
     export(run, tmp_path / "b.ply", exposure_time=2.0)
     shares = [float(line.split()[1]) for line in logged if line.startswith("kept:")]
@@ -84,11 +76,6 @@ def test_colors_of_other_primaries_are_shown_as_srgb(tmp_path, run, logged):
     assert np.abs(field_of(baked).render_ldr(view).numpy() - light).mean() < 0.05, "the fit starts from sRGB"
 
 
-def test_colors_are_fitted_on_the_device_of_the_run(tmp_path, device):
-    renderer = _splat_renderer(gaussians(degree=1), Splats(tmp_path, field_of(gaussians()).to(device), ()), 0.5)
-    assert renderer(camera()).device == torch.device(device)
-
-
 def test_cameras_beside_are_read_again(tmp_path, run):
     export(run, tmp_path / "a.ply", kind="hdr", cameras=True, axes="scene")
     first = json.loads((tmp_path / "a.ply.cameras.json").read_text())[1]
@@ -124,19 +111,6 @@ def test_a_scene_that_does_not_fit_into_the_device_is_exported_as_light_alone(tm
         export(run, tmp_path / "a.ply")
     export(run, tmp_path / "a.ply", kind="hdr")
     assert any(line.startswith("kept: 120.0 dB of the scene at 0 EV") for line in logged)
-
-
-def test_what_is_refused_is_refused_before_the_scene_is_read(tmp_path):
-    (tmp_path / "damaged.ply").write_text("ply")
-    for name in ("a.ply", "a.html", "a.glb.cameras.json"):
-        (tmp_path / name).write_text("mine")
-    for name in ("a.ply", "a.html", "a.glb"):
-        with pytest.raises(InputError, match="exists already"):
-            run_export(Export(run=tmp_path / "damaged.ply", out=tmp_path / name, cameras=name == "a.glb"))
-    with pytest.raises(InputError, match="exists already"):
-        run_convert(Convert(source=tmp_path / "damaged.ply", out=tmp_path / "a.ply"))
-    with pytest.raises(SehdrError, match="brackets need exposures"):
-        run_render(Render(run=tmp_path / "damaged.ply", out=tmp_path, pictures=ViewFileOptions(multipart=True)))
 
 
 def test_panoramas_are_not_among_the_pinholes_beside_a_file(tmp_path, run, logged):

@@ -17,8 +17,7 @@ from sehdr_warp.scene.gravity import UpDirection
 from sehdr_warp.scene.wide_camera import pixel_directions
 
 from ...full_disk import full_disk
-from ..helpers import AnalyticRun, Entry, rendered_view
-from .test_splat_edits import splats
+from ..helpers import AnalyticRun, Entry, rendered_view, splats
 
 pytest.importorskip("skimage")
 RADIUS, FLOOR = 0.6, -0.6  # The ball lies on the floor, its center at the origin; +Y is up

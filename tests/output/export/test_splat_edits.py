@@ -8,36 +8,13 @@ from sehdr_warp.model.visibility import mask_shares
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.export.splat_edits import Box, Sphere, SplatEdits, read_region, without_strays
 from sehdr_warp.output.scene_page import write_scene_page
-from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera, View
 from sehdr_warp.scene.wide_camera import solid_angles
-from sehdr_warp.splats import GaussianArrays, read_gaussians, write_gaussians
+from sehdr_warp.splats import read_gaussians
 
-from ..helpers import Entry, camera
+from ..helpers import camera, run_of, splats
 
 UTM = np.array([5e5, 5.4e6, 100.0])
-
-
-def splats(means, opacities, scale=0.1):
-    """Grey Gaussians of display colors."""
-    count = len(means)
-    opacities = np.asarray(opacities, np.float64)
-    return GaussianArrays(
-        means=np.asarray(means, np.float32),
-        log_scales=np.full((count, 3), np.log(scale), np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
-        harmonics=np.full((count, 1, 3), 0.5, np.float32),
-        color_model="display",
-        base_time=1.0,
-    )
-
-
-def run_of(tmp_path, gaussians, name="s"):
-    write_gaussians(tmp_path / f"{name}.ply", gaussians)
-    run = load_splats(tmp_path / f"{name}.ply")
-    run.cameras = tuple(Entry(str(i), "train", camera(position=(i - 1, 0, -6))) for i in range(3))
-    return run
 
 
 @pytest.fixture

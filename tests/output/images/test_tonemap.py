@@ -7,13 +7,6 @@ from sehdr_warp.output.images.tonemap import LUMINANCE, ToneMap, fit_tone_map
 from ..helpers import radiance
 
 
-def test_srgb_matches_colour_science():
-    import colour
-
-    values = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(encode_srgb(values), colour.models.eotf_inverse_sRGB(values), atol=1e-6)
-
-
 def test_tone_map_and_stops_do_not_depend_on_the_unit_of_radiance():
     image = radiance()
     display = fit_tone_map([image])(image)

@@ -26,17 +26,7 @@ from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
 from sehdr_warp.scene.wide_camera import steradians, typical_focal_length
 from sehdr_warp.splats import GaussianArrays
 
-from ..helpers import Entry, camera
-
-AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float32)
-LIGHT = np.array([[9, 1, 1], [1, 9, 9], [1, 9, 1], [9, 1, 9], [1, 1, 9], [9, 9, 1]], dtype=np.float32)
-
-
-def lamps(width=0.15):
-    """A lamp on each of the six axes, each of a color of its own."""
-    shape = np.full((6, 3), np.log(5 * width), np.float32), np.tile(np.float32([1, 0, 0, 0]), (6, 1))
-    harmonics = LIGHT[:, None] / 0.28209479
-    return GaussianArrays(5 * AXES, *shape, np.full(6, 5, np.float32), harmonics, "linear", 0.5)
+from ..helpers import LIGHT, Entry, camera, lamps
 
 
 @pytest.fixture
@@ -233,12 +223,6 @@ def test_a_point_inside_of_something_is_warned_of(tmp_path, run, logged):
     assert any("inside of something" in line for line in logged)
 
 
-def around(count=12, radius=4.0):
-    """Cameras on a circle about (0, 0, 0), which all look at it."""
-    turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return [camera(position=(radius * np.sin(t), 0.3, radius * np.cos(t)), target=(0, 0, 0)) for t in turns]
-
-
 def test_beyond_leaves_out_what_is_nearer(tmp_path, run):
     import OpenEXR
 
@@ -256,22 +240,6 @@ def test_beyond_leaves_out_what_is_nearer(tmp_path, run):
     assert distance[channels["A"] > 0.5] == pytest.approx(5, rel=1e-3) and header["sehdr:beyond"] == "2.0"
     with OpenEXR.File(str(tmp_path / "all.exr"), separate_channels=True) as file:
         assert file.channels(1)["distance.Z"].pixels[16, 16] < 2.5
-
-
-def test_a_walk_around_something_is_seen_from_its_middle_without_it(tmp_path, run, caplog):
-    caplog.set_level("INFO")
-    cameras = tuple(Entry(str(i), "train", each) for i, each in enumerate(around()))
-    scene = Splats(tmp_path / "run", run.field, cameras)
-    write_environment_map(scene, tmp_path / "env.exr", size=64)
-    header = read(tmp_path / "env.exr")[2]
-    assert np.abs(json.loads(header["sehdr:position"])).max() < 0.1
-    assert float(header["sehdr:beyond"]) == pytest.approx(2, rel=0.01)
-    assert "walk around" in caplog.text and "--beyond" in caplog.text
-    write_environment_map(scene, tmp_path / "other.exr", size=64, beyond=1.5)
-    other = read(tmp_path / "other.exr")[2]
-    assert other["sehdr:position"] == header["sehdr:position"] and float(other["sehdr:beyond"]) == 1.5
-    write_environment_map(scene, tmp_path / "scaled.exr", size=64, beyond=2.0, scale=1.234)
-    assert read(tmp_path / "scaled.exr")[2]["sehdr:beyond"] == "2.0" != repr(2.0 / 1.234 * 1.234)
 
 
 def test_directions_of_a_whole_map_are_computed_for_inpainting_alone(tmp_path, run, monkeypatch):
@@ -310,7 +278,7 @@ def test_a_small_lamp_of_hidden_gaussians_has_its_light_in_maps_of_any_size(tmp_
 @pytest.mark.parametrize("layout", ["latlong", "cube"])
 def test_bands_make_the_same_map(run, layout, monkeypatch):
     whole = render_map(run, np.zeros(3), 32, layout, np.eye(3), 20.0)
-    monkeypatch.setattr(environment_map, "_MOST_PIXELS", 1000)
+    monkeypatch.setattr(environment_map, "BAND_PIXELS", 1000)
     parts = render_map(run, np.zeros(3), 32, layout, np.eye(3), 20.0)
     for name in ("hdr", "alpha", "distance"):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-5, atol=1e-6)

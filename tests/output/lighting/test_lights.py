@@ -10,8 +10,6 @@ import torch
 
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.model.light_shapes import LightShape
-from sehdr_warp.model.lights import Light, ReceivedLight
 from sehdr_warp.output.commands import Lights, WorldOptions, run_lights
 from sehdr_warp.output.lighting import lights as lighting
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles, write_environment_map
@@ -22,15 +20,7 @@ from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
 from sehdr_warp.splats import GaussianArrays
 
-from ..helpers import Entry, camera
-from .test_environment_map import lamps
-
-PANEL = LightShape("rect", np.array([1.0, 0.5, 2.0]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (0.4, 0.2))
-BALL = LightShape("sphere", np.array([0.0, 0.0, 3.0]), np.eye(3), (0.3, 0.3))
-LIGHTS = [
-    Light(PANEL, np.array([8.0, 4.0, 2.0]), np.ones(3), 0.4, 0.5, torch.tensor([0])),
-    Light(BALL, np.array([3.0, 3.0, 3.0]), np.ones(3), None, 0.2, torch.tensor([1, 2])),
-]
+from ..helpers import LIGHTS, PANEL, Entry, camera, lamps, received
 
 
 @pytest.fixture
@@ -42,15 +32,6 @@ def run(tmp_path, monkeypatch):
     # Lights that reach every place with their radiance.
     monkeypatch.setattr(lighting, "received_light", lambda field, place, *_, **__: received(place))
     return scene
-
-
-def received(place):
-    """Return what reaches a place: the first Gaussian of each light gives all of its light."""
-    angles, light = torch.zeros(6, dtype=torch.float64), torch.zeros(6, 3, dtype=torch.float64)
-    for each in LIGHTS:
-        angles[each.members[0]] = each.shape.solid_angle(place)
-        light[each.members[0]] = torch.from_numpy(each.radiance * each.shape.solid_angle(place))
-    return ReceivedLight(angles, angles, light)
 
 
 def test_json_has_every_figure(tmp_path, run):
@@ -225,26 +206,6 @@ def test_lights_and_rest_light_a_place_as_its_map_does(tmp_path):
         assert np.array(row["radiance"]) * light.shape.solid_angle(place) == pytest.approx(lost, rel=0.1, abs=1e-3)
 
 
-def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):
-    monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
-    run.find_lights = list
-    run_lights(Lights(run=run.path))
-    assert capsys.readouterr().out == "no lights: nothing that the photos clipped gives light\n"
-
-
-def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
-    monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
-    run_lights(Lights(run=run.path, world=WorldOptions(axes="scene")))
-    table = capsys.readouterr().out
-    assert "(1, 0.5, 2), 0.4 x 0.2" in table and "measure them" not in table
-    write_lights(run, run.path.with_name("lights.json"))
-    rows = json.loads(run.path.with_name("lights.json").read_text())["lights"]
-    assert [line.split()[0] for line in table.splitlines()[1:]] == [row["name"] for row in rows]
-    run_lights(Lights(run=run.path, world=WorldOptions(scale=10.0)))
-    place = ", ".join(f"{value:.3g}" for value in world_transform(run, scale=10.0).points(PANEL.position))
-    assert f"({place}), 4 x 2" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("bound, remedy", [(1.0, "3 stops darker"), (4.0, "1 stop darker"), (9.0, "1 stop darker")])
 def test_uncertain_lights_are_named_with_their_remedy(bound, remedy):
     """Photos so dark that the strongest lights, of up to 8, are below their white."""
@@ -265,3 +226,23 @@ def test_what_cannot_be_written_is_refused(tmp_path, run):
     with pytest.raises(InputError, match="lights_rest.exr"):
         write_lights(run, tmp_path / "lights.usda")
     assert not (tmp_path / "lights.usda").exists()
+
+
+def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
+    run.find_lights = list
+    run_lights(Lights(run=run.path))
+    assert capsys.readouterr().out == "no lights: nothing that the photos clipped gives light\n"
+
+
+def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
+    monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
+    run_lights(Lights(run=run.path, world=WorldOptions(axes="scene")))
+    table = capsys.readouterr().out
+    assert "(1, 0.5, 2), 0.4 x 0.2" in table and "measure them" not in table
+    write_lights(run, run.path.with_name("lights.json"))
+    rows = json.loads(run.path.with_name("lights.json").read_text())["lights"]
+    assert [line.split()[0] for line in table.splitlines()[1:]] == [row["name"] for row in rows]
+    run_lights(Lights(run=run.path, world=WorldOptions(scale=10.0)))
+    place = ", ".join(f"{value:.3g}" for value in world_transform(run, scale=10.0).points(PANEL.position))
+    assert f"({place}), 4 x 2" in capsys.readouterr().out

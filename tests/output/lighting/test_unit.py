@@ -21,9 +21,7 @@ from sehdr_warp.runs.run import Splats
 from sehdr_warp.runs.values import LIGHT_UNIT_FILE
 from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
 
-from ..helpers import AnalyticRun, Entry, camera
-from .test_environment_map import lamps
-from .test_lights import LIGHTS, received
+from ..helpers import LIGHTS, AnalyticRun, Entry, camera, lamps, received
 
 
 @pytest.fixture

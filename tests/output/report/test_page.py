@@ -1,43 +1,35 @@
 """report.html as strangers meet it: valid, alone, small, and with the light that it says it has."""
 
-import ast
 import base64
 import hashlib
 import html
 import io
-import os
 import re
-import shutil
-import subprocess
-import zlib
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp import output
 from sehdr_warp.output.images.display import display_gain
-from sehdr_warp.output.light_pictures import CURVE_SIZE, CURVE_STOPS, curve_table
 from sehdr_warp.output.notebook import run_html
-from sehdr_warp.output.report.comparison import Comparison, darker_stops, first_picture
-from sehdr_warp.output.report.diagrams import training_svg
 from sehdr_warp.output.report.write import write_report
 from sehdr_warp.output.world_transform import world_transform
-from sehdr_warp.response import response_by_name
-from sehdr_warp.response.learned import ToneMapper
 
 from ...viewer.browser import browser, page_of
-from ..helpers import AnalyticRun
-from ..lighting.test_lights import LIGHTS
-from .test_write import make
+from ..helpers import LIGHTS, AnalyticRun, make, validate
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
+
+
 PLAN = [{"name": "brackets", "choice": "plain <scaling>", "reason": "0.0% of the pixels clip"}]
+
+
 FIGURES = {"psnr": 31.4, "ssim": 0.9}, {"psnr_mu": 28.2, "ssim_mu": None}
+
+
 EVALUATION = {
     "views": [{"name": "v_1", "ldr": FIGURES[0], "protocol": {"gt-max": FIGURES[1]}}],
     "ldr": FIGURES[0],
@@ -53,18 +45,6 @@ def page(tmp_path, *, unexplained=True, **options):
     run.summary = lambda: {"unexplained": {"regions": 2, "photos": 1, "worst": worst}} if unexplained else {}
     run.decisions = lambda: PLAN
     return write_report(run, scene, tmp_path / "report", evaluation=EVALUATION)[0].read_text()
-
-
-def validate(text):
-    """HTML that no parser, and none of the validators that are here, complains about."""
-    pytest.importorskip("html5lib").HTMLParser(strict=True).parse(text)
-    folders = [
-        Path(folder, "vnu-jar/build/dist/vnu.jar") for folder in os.environ.get("NODE_PATH", "").split(os.pathsep)
-    ]
-    commands = [["tidy", "-q", "-e"], *(["java", "-jar", str(jar), "-"] for jar in folders if jar.is_file())]
-    for command in (command for command in commands if shutil.which(command[0])):
-        checked = subprocess.run(command, input=text, capture_output=True, text=True)
-        assert checked.returncode == 0 and not checked.stderr, checked.stderr
 
 
 def headings(text):
@@ -124,32 +104,6 @@ def test_the_pictures_keep_the_light_and_look_like_photos(tmp_path):
     assert inside.any() and np.median(decoded[inside] / light[inside]) == pytest.approx(1, abs=0.02)
     plain = np.asarray(Image.open(io.BytesIO(base64.b64decode(thumbnail[1])))) / 255
     np.testing.assert_allclose(plain.mean((0, 1)), run.response.encode(exposure).clip(0, 1).mean((0, 1)), atol=0.01)
-
-
-def test_middle_grey_of_the_photo_is_shown_as_middle_grey():
-    assert display_gain(response_by_name("srgb")) == pytest.approx(1, rel=1e-4)
-    for response in (response_by_name("hdr-nerf"), ToneMapper()):
-        grey = response.encode(np.full((1, 3), 0.18 / display_gain(response)))
-        assert grey[0, 1] == pytest.approx(0.4614, abs=1e-3)
-
-
-def test_the_curve_of_pages_is_that_of_a_learned_response():
-    stops, response = np.linspace(*CURVE_STOPS, CURVE_SIZE), ToneMapper()
-    table = np.frombuffer(base64.b64decode(curve_table(response)), "<f2")
-    np.testing.assert_allclose(table, response.encode(2.0 ** stops[:, None].repeat(3, 1))[:, 1], atol=1e-3)
-
-
-def test_a_run_shows_itself_in_a_notebook():
-    run = AnalyticRun()
-    text = run_html(run)
-    page = html.unescape(re.fullmatch(r'<iframe srcdoc="([^"]*)" [^<>]*sandbox[^<>]*></iframe>', text)[1])
-    validate(page)
-    assert "1,234 Gaussians" in page and "t_0" in page and not re.findall(r"https?://", page)
-    packed = re.search(r'data-light="scene">([^<]*)<', page)[1]
-    light = np.frombuffer(zlib.decompress(base64.b64decode(packed)), "<f2").reshape(24, 32, 3)
-    np.testing.assert_allclose(light, run.render(run.cameras[3].camera).hdr * 0.5, rtol=1e-3)
-    run.cameras = []
-    assert "dial" in run_html(run) and "data-light=" not in run_html(run).replace("script[data-light]", "")
 
 
 EVIL = """</script><script>window.PWNED=1</script><img src=x onerror="window.PWNED=1">'"&"""
@@ -224,56 +178,6 @@ def test_browsers_run_our_script_and_no_other(tmp_path):
             assert page.evaluate("typeof startDial") == "function"
             assert page.evaluate("document.querySelectorAll('.dial canvas').length") == 1
             page.close()
-
-
-@pytest.mark.parametrize("path", sorted(Path(output.__file__).parent.rglob("*.py")), ids=lambda path: path.name)
-def test_no_markup_is_made_but_by_the_one_function(path):
-    """Of f-strings nothing escapes what goes in, and a template that is made of text is no template."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        for part in node.values if isinstance(node, ast.JoinedStr) else ():
-            if isinstance(part, ast.Constant):
-                assert not re.search(r"<[a-zA-Z/!]", part.value), f"{path.name}:{node.lineno}"
-        name = getattr(getattr(node, "func", None), "id", "")
-        if name == "markup":
-            assert isinstance(node.args[0], ast.Constant | ast.Name), f"{path.name}:{node.lineno}"
-        assert name != "Markup" or path.name == "html.py", f"{path.name}:{node.lineno}"
-
-
-def test_the_first_picture_shows_what_photos_clip_as_grey():
-    flat = np.full((4, 4, 3), 2.0)
-    thumbnail = Comparison("v", np.ones((4, 4, 3)), flat, flat * 30, 0.5, 1.0)
-    # White of 2 s^-1 for half a second is an exposure of 1: two stops darker it is a quarter.
-    assert darker_stops([thumbnail]) == -2
-    assert darker_stops([replace(thumbnail, gain=8.0)]) == -5
-    times = [darker_stops([replace(thumbnail, exposure_time=time)]) for time in (1e-9, 1e9)]
-    assert times == [-1, -12]
-    assert first_picture(thumbnail).lead == "View v, 2 stops darker. What the photo clipped stays flat."
-
-
-def test_a_photo_that_clips_nothing_is_opened_as_it_was_taken():
-    flat = np.full((4, 4, 3), 0.5)
-    first = first_picture(Comparison("v", flat, flat, flat, 0.5, 1.0))
-    assert (first.stops, first.title) == (0, "Photo and scene") and "next to no light" in first.lead
-
-
-def test_a_scene_without_light_above_white_is_not_opened_dark():
-    white, flat = np.ones((4, 4, 3)), np.full((4, 4, 3), 2.0)
-    assert first_picture(Comparison("v", white, flat, flat, 0.5, 1.0)).title == "Photo and scene"
-    steep = flat * [[[1.0, 1.0, 0.01]]]  # Of a code just below white, which a steep response decodes to far less
-    assert first_picture(Comparison("v", white, steep, flat, 0.5, 1.0)).title == "Photo and scene"
-
-
-def test_times_of_a_short_training_are_at_their_places():
-    chart = training_svg([{"psnr_ldr": 20.0 + time, "seconds": time} for time in (1.0, 10.0)])
-    assert re.findall(r">([\d.]+ s)<", chart) == ["0 s", "2 s", "4 s", "6 s", "8 s", "10 s"]
-
-
-def test_levels_of_a_chart_differ_and_fit_beside_it():
-    for figures in ([20.3], [24.1, 24.31], [20.0, 22.4], [9.0, 39.0]):
-        chart = training_svg([{"psnr_ldr": decibels, "seconds": 5.0} for decibels in figures])
-        levels = [float(level) for level in re.findall(r'x="0"[^>]*>(\d+) dB<', chart)]
-        assert levels == sorted(set(levels)) and 3 <= len(levels) <= 8
-        assert levels[0] <= min(figures) and max(figures) <= levels[-1]
 
 
 def test_a_phone_sees_the_whole_chart_and_all_brackets(tmp_path):

@@ -26,10 +26,9 @@ from sehdr_warp.scene import Camera
 from sehdr_warp.splats.arrays import HARMONIC_0
 from sehdr_warp.training.train import train
 
-from ..output.export.test_splat_edits import run_of, splats
-from ..output.helpers import Entry, camera
 from ..training.toy import toy_scene
-from .browser import browser, page_of, pinch, pixels
+from ..viewer.browser import browser, page_of, pinch, pixels
+from .helpers import Entry, camera, run_of, splats
 
 FULL = "#stage[data-frame=full]"
 
