@@ -177,7 +177,7 @@ class FinishedTraining:
         what = f"the camera{'s' if several else ''} of {first_names(names, 10)} seem{'' if several else 's'} wrong"
         shows = "these photos alone show" if several else "this photo alone shows"
         reason = f"{shows} another scene over much of the picture"
-        return f"{what}: {reason}; leave {'them' if several else 'it'} out: {self._again}"
+        return f"{what}: {reason}; move {'them' if several else 'it'} elsewhere: {self._again}"
 
     def _movement(self) -> list[str]:
         """Return advice on masks or uncertain cameras, if photos differ from the scene in many places, not by blur."""
@@ -192,7 +192,7 @@ class FinishedTraining:
         text = "photos and scene differ in many places"
         if 2 * sum(region["photo"] in self.uncertain for region in worst) > len(worst):
             names = first_names([photo for photo in photos if photo in self.uncertain])
-            remedy = "add photos from places between them and the others, or leave them out"
+            remedy = "add photos from places between them and the others, or move them elsewhere"
             return [f"{text}, most in photos whose cameras are uncertain ({names}): {remedy}: {self._again}"]
         remedy = "make these black in the photos' masks, masks/PHOTO.png beside them"
         return [f"{text}, as where people or leaves move (worst in {first_names(photos)}): {remedy}: {self._again}"]

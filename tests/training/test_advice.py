@@ -138,9 +138,9 @@ def test_single_photos_that_show_another_scene_have_wrong_cameras():
         return advice(Path("r"), figures | found, 40, **{"sizes": sizes} | options)
 
     [line] = lines(2)
-    assert line.startswith("the cameras of p0, p1 seem wrong: these photos") and "leave them out" in line
+    assert line.startswith("the cameras of p0, p1 seem wrong: these photos") and "; move them elsewhere: " in line
     [line] = lines(1)
-    assert line.startswith("the camera of p0 seems wrong: this photo alone shows") and "leave it out" in line
+    assert line.startswith("the camera of p0 seems wrong: this photo alone shows") and "; move it elsewhere: " in line
     assert lines(2, pixels=50) == lines(2, stops=2.0) == lines(5) == lines(2, sizes={}) == []
     [line] = lines(1, offset=5.0)
     assert line.startswith("1 photo is brighter or darker")
