@@ -231,7 +231,7 @@ class EnvironmentMap:
     at: str = "center"
     """x,y,z in upright coordinates or those of --axes (0,0,0: what most photos look at), camera:NAME, or center: the
     middle of the training cameras, or what they walk around."""
-    size: int = 2048  # Pixels across; for a cube those of one face.
+    size: int | None = None  # Pixels across, 2048 by default; for a cube those of one face, 512.
     layout: Literal["latlong", "cube"] = "latlong"
     """Latitude and longitude, twice as wide as high; or OpenEXR's six faces, one above the other."""
     world: WorldOptions = WorldOptions()

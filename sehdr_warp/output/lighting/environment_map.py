@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ...runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
-LAYOUTS = ("latlong", "cube")
+LAYOUTS = {"latlong": 2048, "cube": 512}  # Pixels across by default, equally fine
 SUFFIXES = (".exr", ".hdr")
 LEAST_VISIBLE = 1e-3  # Share of all directions below which nothing counts as visible from a point
 COVERED = 0.5  # Alpha above which a direction counts as covered
@@ -56,7 +56,7 @@ def write_environment_map(
     path: Path | str,
     *,
     at: str | tuple[float, float, float] = "center",
-    size: int = 2048,
+    size: int | None = None,
     layout: str = "latlong",
     axes: str = "upright",
     up: str | tuple[float, float, float] | None = None,
@@ -76,7 +76,7 @@ def write_environment_map(
             confidence and clipped; attribute `envmap`) or .hdr (Radiance: R, G, B only).
         at: A point in the coordinates that `axes` names, "camera:NAME", or "center": the mean of the training
             cameras, or, if they walk around something, the point that they look at.
-        size: Pixels across; for a cube those of one face.
+        size: Pixels across, 2048 by default; for a cube those of one face, 512.
         layout: "latlong": size x size / 2, the left edge at longitude pi, +Z in the middle, +X at a quarter, +Y up.
             "cube": OpenEXR's six faces, one above the other.
         axes: "upright": turned as render and export turn the scene (see world_transform), so that the map lights its
@@ -102,6 +102,7 @@ def write_environment_map(
     refuse_paths("load_run", run)
     path = Path(path)
     check_map(path, size, layout, axes, beyond, pixel)
+    size = size or LAYOUTS[layout]
     color_space(colorspace)
     transform = world_transform(run, axes, up=up, scale=scale)
     exposure = exposure_for_white(run, reference_white)
@@ -170,7 +171,7 @@ def map_part(
     return replace(part, header={**part.header, "envmap": envmap(layout)})
 
 
-def check_map(path: Path, size: int, layout: str, axes: str, beyond: float | None, pixel: str) -> None:
+def check_map(path: Path, size: int | None, layout: str, axes: str, beyond: float | None, pixel: str) -> None:
     """Raise the errors of write_environment_map() about options that need no scene."""
     if path.suffix.lower() not in SUFFIXES:
         raise SehdrError(f"{path}: an environment map is one of {', '.join(SUFFIXES)}; choose a suffix")
@@ -179,7 +180,7 @@ def check_map(path: Path, size: int, layout: str, axes: str, beyond: float | Non
     for name, value, allowed in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):
         if value not in allowed:
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")
-    if size < 16 or size % 2 or size > _LARGEST:
+    if size is not None and (size < 16 or size % 2 or size > _LARGEST):
         raise SehdrError(f"size {size} is not usable; give an even number of pixels from 16 to {_LARGEST}")
     if beyond is not None and not 0 <= beyond < np.inf:
         raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the units of exported files")

@@ -276,6 +276,14 @@ def test_a_small_lamp_of_hidden_gaussians_has_its_light_in_maps_of_any_size(tmp_
 
 
 @pytest.mark.parametrize("layout", ["latlong", "cube"])
+def test_maps_of_both_layouts_are_equally_fine_by_default(tmp_path, run, layout, monkeypatch):
+    assert environment_map.LAYOUTS["latlong"] == 4 * environment_map.LAYOUTS["cube"]
+    monkeypatch.setattr(environment_map, "LAYOUTS", {"latlong": 64, "cube": 16})
+    write_environment_map(run, tmp_path / "a.exr", layout=layout)
+    assert read(tmp_path / "a.exr")[0].shape[:2] == {"latlong": (32, 64), "cube": (96, 16)}[layout]
+
+
+@pytest.mark.parametrize("layout", ["latlong", "cube"])
 def test_bands_make_the_same_map(run, layout, monkeypatch):
     whole = render_map(run, np.zeros(3), 32, layout, np.eye(3), 20.0)
     monkeypatch.setattr(environment_map, "BAND_PIXELS", 1000)
