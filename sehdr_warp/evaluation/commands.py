@@ -66,7 +66,7 @@ class Compare:
 
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """Folders of runs, or a folder that holds runs; of these, those without an evaluation yet are left out."""
-    plot: Path | None = None  # Also draw held-out error against training time to this PNG file.
+    plot: Path | None = None  # Also draw held-out PSNR against training time to this PNG file.
     csv: Path | None = None  # Also write the table to this CSV file.
     latex: Path | None = None  # Also write the table to this LaTeX file (booktabs).
     overwrite: bool = False  # Replace files that exist.

@@ -1,4 +1,4 @@
-"""Compare trained runs: figures, means over seeds, held-out error; and the tables of `compare` and `eval`."""
+"""Compare trained runs: figures, means over seeds, held-out PSNR; and the tables of `compare` and `eval`."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Charts of trainings: held-out error against time."""
+"""Charts of trainings: held-out PSNR against time."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Diagrams of the report as SVG: held-out error against time, and where the photos were taken."""
+"""Diagrams of the report as SVG: held-out PSNR against time, and where the photos were taken."""
 
 import base64
 import io

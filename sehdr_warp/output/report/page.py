@@ -68,7 +68,7 @@ def report_page(
         _plan(run.decisions()),
         _table(evaluation, held_out),
         _section(
-            "Error against time", "Of all held-out photos, while it was trained.", _figure(training_svg(run.metrics()))
+            "PSNR over time", "Of all held-out photos, while it was trained.", _figure(training_svg(run.metrics()))
         ),
         _map(run, comparisons),
         _footer(run, held_out),

@@ -57,7 +57,7 @@ def write_report(
     brackets with an exposure dial, lights, confidence, unexplained regions, error against time, cameras. For papers:
     `comparison.png`: photo; photo, HDR scene and truth (if known) some stops darker; a new view. `stops.png`: the view
     with the most light above white from -4 to +4 stops: the photo alone, the HDR scene with its confidence, the truth.
-    `training.png`: held-out error against training time; absent for a run without evaluations. A scene without test
+    `training.png`: held-out PSNR against training time; absent for a run without evaluations. A scene without test
     views shows training views, and captions say so.
 
     Args:
@@ -176,7 +176,7 @@ def _grid(rows, titles: Sequence[str], names: Sequence[str], caption: str, *, ce
                 axes.set(xticks=[], yticks=[])  # A frame shows where a white picture ends.
                 axes.set_title(titles[column] if row == 0 else "", fontsize=9.5, fontweight="bold")
                 axes.set_ylabel(name if column == name_column else "", fontsize=8.5)
-        figure.supxlabel(textwrap.fill(caption, round(16 * width)), x=0.02, ha="left", fontsize=8.5, color=QUIET)
+        figure.supxlabel(textwrap.fill(caption, round(14 * width)), x=0.02, ha="left", fontsize=8.5, color=QUIET)
         return figure
 
 

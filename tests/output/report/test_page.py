@@ -57,7 +57,7 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", text) and "url(" not in text
     assert len(text) < 5e6
     expected = ["Light above white", "Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
-    assert headings(text) == [*expected, "What was left out, and why", "Figures", "Error against time", "Cameras"]
+    assert headings(text) == [*expected, "What was left out, and why", "Figures", "PSNR over time", "Cameras"]
     assert "<li>a note of <code>the training</code></li>" in text
     assert text.index("<h2>Light above white") < text.index('class="facts"') < text.index("<h2>Photo, scene, truth")
     for checked in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "65 s", "+1.2<", "\N{MINUS SIGN}2<"):
@@ -87,7 +87,7 @@ def test_lights_are_listed_with_what_is_certain_of_them(tmp_path, monkeypatch):
 
 def test_what_is_not_known_is_left_out(tmp_path):
     text = page(tmp_path, truth=False, splits=("train", "train"), metrics=None, unexplained=False)
-    assert "What stays unexplained" not in headings(text) and "Error against time" not in headings(text)
+    assert "What stays unexplained" not in headings(text) and "PSNR over time" not in headings(text)
     assert "none is held out" in text and 'data-name="Truth"' not in text
     assert "--out views --cameras train --evs" in text
     assert headings(text)[1] == "Photo and scene" and "Scene and truth" not in text

@@ -60,7 +60,10 @@ def test_stops_show_what_the_photo_lost(tmp_path):
     assert np.ptp(photo[0][clipped]) < 1e-6
     assert np.ptp(hdr[0][clipped]) > 0.01
     np.testing.assert_array_equal(hdr, truth)
-    trusted = stops_figure(replace(comparison, confidence=confidence)).axes[6]
+    figure = stops_figure(replace(comparison, confidence=confidence, name="100_7104", exposure_time=1 / 508))
+    figure.draw_without_rendering()
+    assert figure.get_children()[-1].get_window_extent().x1 < figure.bbox.x1
+    trusted = figure.axes[6]
     assert trusted.texts[0].get_text() == "Confidence" and np.all(trusted.get_images()[0].get_array() == 0.25)
 
 
