@@ -13,8 +13,8 @@ TOPICS = {
     "output": {"blender"},
     "rasterizer": {"culling", "extremes", "properties", "rasterize"},
     "training": {
-        "bad_input", "confidence", "deterministic", "divergence", "fields", "nodes", "out_of_memory", "reserved_rows",
-        "resume", "rivals", "units",
+        "bad_input", "confidence", "deterministic", "fields", "nodes", "out_of_memory", "reserved_rows", "resume",
+        "units",
     },
     "viewer": {"proxies"},
 }  # fmt: skip

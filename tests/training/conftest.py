@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from sehdr_warp.training.scene_facts import measure_scene
 from sehdr_warp.training.train import create_trainer
 
 from ..make_scenes import write_blender
@@ -20,6 +21,11 @@ def quickly(few_probes):
 @pytest.fixture(scope="session")
 def scene():
     return toy_scene()
+
+
+@pytest.fixture(scope="session")
+def facts(scene):
+    return measure_scene(scene)
 
 
 @pytest.fixture(scope="session")

@@ -180,23 +180,18 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
 
 def test_large_photos_are_matched_and_evened_small(monkeypatch):
     """Full-size copies of a large set, evened again and again, would take more memory than there is."""
-    (scene, _), sizes, even, most = drifting(), [], ExposureCompensation._view, 96
+    (scene, _), sizes, even, most = drifting(), [], ExposureCompensation.normalize_photos, 96
     monkeypatch.setattr("sehdr_warp.training.matching.LARGEST_SIDE", most)
-    factor = 2
     large = tuple(
-        replace(
-            view,
-            codes=view.codes.repeat(factor, 0).repeat(factor, 1),
-            camera=view.camera.resized(64 * factor, 64 * factor),
-        )
+        replace(view, codes=view.codes.repeat(2, 0).repeat(2, 1), camera=view.camera.resized(128, 128))
         for view in scene.views
     )
 
-    def watched(gains, view, response):
-        sizes.append(max(view.codes.shape))
-        return even(gains, view, response)
+    def watched(gains, scene, response):
+        sizes.extend(max(view.codes.shape) for view in scene.views)
+        return even(gains, scene, response)
 
-    monkeypatch.setattr(ExposureCompensation, "_view", watched)
+    monkeypatch.setattr(ExposureCompensation, "normalize_photos", watched)
     drift, _ = found_in(replace(scene, views=large), CONFIG, LINEAR, "cpu")
     assert drift is not None and max(large[0].codes.shape) > most
     assert sizes and max(sizes) <= most

@@ -1,6 +1,7 @@
 """The model of cost, against measurements in docs/reports that it was fitted to and others."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from sehdr_warp.training.cost import (
     block_cost,
     choices,
     exchange_seconds,
+    gain_of_ranks,
     recommend,
     step_seconds,
     training_cost,
@@ -131,3 +133,12 @@ def test_gpus_that_gain_nothing_are_not_listed_unless_they_are_named():
     assert [choice.name for choice in choices(quick, quick, 1, None, 4)] == ["1 GPU", "4 GPUs"]
     long = replace(quick, pixels=2e6, gaussians=1e6, iterations=30_000)
     assert len(choices(long, long, 1, None)) == 5
+
+
+def test_small_scenes_are_told_that_they_gain_nothing():
+    gpu = torch.device("cuda", 0)
+    assert "too few to gain" in gain_of_ranks(2, 2_000, 10_000, 4000, gpu)
+    large = gain_of_ranks(2, 1_000_000, 2_000_000, 30_000, gpu)
+    assert "estimated 1." in large and "too few" not in large
+    assert "no faster than one" in gain_of_ranks(2, 1_000_000, 2_000_000, 30_000, torch.device("cpu"))
+    assert math.isfinite(float(gain_of_ranks(8, 10**6, 10**6, 10**4, gpu).split("estimated ")[1].split()[0]))

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,8 +15,8 @@ from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.color_models import make_color_model
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.prior import LightPrior
-from sehdr_warp.response import response_by_name
-from sehdr_warp.runs.config import Config
+from sehdr_warp.response import ToneMapper, response_by_name
+from sehdr_warp.runs.config import Config, ResponseConfig
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.field import assemble_field
 from sehdr_warp.scene import Camera
@@ -28,11 +29,14 @@ from sehdr_warp.training.initialization import (
     colors_in_views,
     focus_distance,
     make_field,
+    make_matcher,
     random_points,
     response_for_training,
+    start_count,
+    start_points,
 )
 from sehdr_warp.training.seeding import brighten_clipped, expected_excess
-from sehdr_warp.training.train import create_trainer
+from sehdr_warp.training.train import create_trainer, train
 from tests.splats.samples import gaussians
 
 from .toy import orbit_camera, toy_scene
@@ -263,3 +267,54 @@ def test_a_training_starts_above_white_and_asks_the_network_once(tmp_path, monke
         trainer.train()
     assert most[0.0] <= 1 < 1.1 < most[0.01]
     assert len(calls) == len(scene.train_views)
+
+
+def test_a_learned_tone_mapper_starts_as_hdr_gs_does(scene):
+    config = Config(response=ResponseConfig(name="learned"), seed=5)
+    mapper = response_for_training(scene, config)
+    assert isinstance(mapper, ToneMapper) and mapper.width == 128
+    assert torch.equal(mapper.weights[0], ToneMapper(seed=5).weights[0])
+    encoded = np.array([[0.2, 0.5, 0.9]])
+    assert np.allclose(make_color_model("log").start(encoded, mapper), encoded)
+    assert np.allclose(make_color_model("linear").start(encoded, mapper), np.exp(encoded))
+    assert not np.allclose(make_color_model("log").start(encoded, response_by_name("srgb")), encoded)
+
+
+def never():
+    raise AssertionError("nothing is to be matched")
+
+
+def test_start_points_are_the_scenes_and_matched_ones():
+    scene, config = wall_and_lamp(), load_config("default", {"model.initial_density": 4.0})
+    assert start_count(config, 9 * 64 * 64) == 768
+    own = np.array([[0.0, 0.0, 3.0]] * 300)
+    inputs = replace(scene, points=own, point_colors=np.full((300, 3), 0.5, np.float32))
+    points, colors = start_points(
+        inputs, config, partial(make_matcher, inputs, LINEAR, "cpu"), np.random.default_rng(0)
+    )
+    assert 300 < len(points) == len(colors) <= 800 and np.array_equal(points[:300], own)
+    none = load_config("default", {"model.initial_density": 0.0})
+    assert len(start_points(inputs, none, never, np.random.default_rng(0))[0]) == 300
+    # Without any, they are drawn where cameras look.
+    assert len(start_points(scene, none, never, np.random.default_rng(0))[0]) == 5000
+
+
+def test_a_scene_of_two_photos_or_of_none_that_match_still_starts(tmp_path):
+    scene = wall_and_lamp()
+    two = replace(scene, views=scene.views[:2])
+    config = load_config("default", {"schedule.iterations": 3, "plan.enabled": False, "response.name": "linear"})
+    assert train(two, tmp_path / "two", config, device="cpu").summary()["iteration"] == 3
+    rng = np.random.default_rng(0)
+    noise = tuple(replace(v, codes=rng.integers(0, 256, v.codes.shape, dtype=np.uint8)) for v in scene.views)
+    assert train(replace(scene, views=noise), tmp_path / "noise", config, device="cpu").summary()["iteration"] == 3
+
+
+def test_back_to_back_photos_are_refused(tmp_path):
+    scene = wall_and_lamp()
+    turned = scene.views[1].camera.world_to_camera.copy()
+    turned[[0, 2]] *= -1
+    other = replace(scene.views[1], camera=replace(scene.views[1].camera, world_to_camera=turned))
+    two = replace(scene, views=(scene.views[0], other))
+    config = load_config("default", {"plan.enabled": False, "response.name": "linear"})
+    with pytest.raises(SehdrError, match="no two training cameras"):
+        train(two, tmp_path / "run", config, device="cpu")

@@ -1,38 +1,31 @@
 """Losses: forms, one-sidedness where the camera saturated, masks, and which side learns."""
 
+import dataclasses
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.renders import PhotoRender
-from sehdr_warp.rasterizer.losses.code_residual import code_tensor
 from sehdr_warp.rasterizer.losses.ssim import ssim
-from sehdr_warp.response import response_by_name
+from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import LossConfig
-from sehdr_warp.training.losses import MAX_LOG_SIZE, image_loss, ldr_loss, linear_loss, size_loss
-from sehdr_warp.training.targets import CODE, Target, code_scale, mu_law, mu_of_knee
+from sehdr_warp.training.losses import (
+    MAX_LOG_SIZE,
+    anchor_loss,
+    data_loss,
+    hdr_loss,
+    image_loss,
+    ldr_loss,
+    linear_loss,
+    size_loss,
+)
+from sehdr_warp.training.targets import CODE, mu_law, mu_of_knee
 
-
-def images(seed=0, shape=(12, 14, 3)):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
-
-
-def target_of(encoded, response=None, *, truth=None, clipping=True, bits=8):
-    """The target of encoded values [H, W, 3]: compared as light where a response is given."""
-    white = 2**bits - 1
-    codes = (encoded.detach().double() * white).round().numpy().astype(np.uint16 if bits == 16 else np.uint8)
-    scale = code_scale(white, response, "cpu", clipping=clipping, dtype=encoded.dtype)
-    return Target(code_tensor(codes, "cpu"), scale, exposure_truth=truth)
-
-
-def row(*values):
-    """[1, values, 3] of equal channels."""
-    return torch.tensor(values).reshape(1, -1, 1).expand(1, len(values), 3).clone()
+from .test_targets import images, row, target_of
+from .toy import make_trainer, quick
 
 
 @pytest.mark.parametrize("form,weights", [("sum", (1.0, 0.2)), ("blend", (0.8, 0.2))])
@@ -53,16 +46,6 @@ def test_masked_pixels_cost_nothing():
     assert image_loss(a, b, mask, "sum", 0.2) == image_loss(a, changed, mask, "sum", 0.2)
     expected = (a - b)[:, :7].abs().mean()
     assert image_loss(a, b, mask, "sum", 0.0).item() == pytest.approx(expected.item(), rel=1e-5)
-
-
-def test_the_psnr_of_a_step_leaves_out_what_the_mask_does():
-    image, _ = images()
-    target = target_of(image + 0.1 * (0.5 - image).sign())
-    mask = torch.ones(12, 14, 1)
-    mask[:, :5] = 0
-    hidden = torch.where(mask > 0, image, 1 - image)
-    assert target.psnr(image) == pytest.approx(20, abs=0.3)
-    assert target.psnr(hidden) < 12 and replace(target, mask=mask).psnr(hidden) == pytest.approx(20, abs=0.3)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -111,29 +94,6 @@ def test_clipped_light_is_held_at_its_estimate_as_firmly_as_that_is_sure():
     assert plain.grad[0, :4].abs().max() == 0 and plain.grad[0, 4, 0] == light.grad[0, 4, 0]
 
 
-def test_a_code_is_worth_the_middle_of_what_it_stands_for():
-    response = response_by_name("hdr-nerf")
-    scale = code_scale(255, response, "cpu", dtype=torch.float64)
-    light = response.white * torch.expm1(scale.table[:, 0] * math.log1p(scale.mu)) / scale.mu
-    least, most = (float(response.decode((254 + half) / 255)) for half in (-0.5, 0.5))
-    # The curve is so flat there that the code stands for one and a half stops.
-    assert light[254].item() == pytest.approx(math.sqrt(least * most), rel=1e-3)
-    assert light[128].item() == pytest.approx(float(response.decode(128 / 255)), rel=1e-3)
-
-
-@pytest.mark.parametrize("clipping", [True, False])
-def test_light_anywhere_within_what_a_code_stands_for_is_as_good_once_it_is_an_interval(clipping):
-    response = response_by_name("hdr-nerf")
-    places = torch.linspace(253.6, 254.4, 8, dtype=torch.float64).view(1, -1, 1).expand(1, -1, 3)
-    light = response.decode(places / 255).requires_grad_()
-    target = target_of(torch.full((1, 8, 3), 254 / 255).double(), response, clipping=clipping)
-    for wide in (False, clipping):
-        loss = ldr_loss(PhotoRender(light, light, light, None, light), target, LossConfig(clipped_smoothness=0.0))
-        (slopes,) = torch.autograd.grad(loss, light)
-        assert (loss.item() < 1e-12) == wide and bool((slopes == 0).all()) == wide
-        target.scale.use_intervals()
-
-
 def test_without_clipping_an_overshoot_costs():
     predicted, target = torch.full((2, 2, 3), 1.3), target_of(torch.ones(2, 2, 3), clipping=False)
     loss = ldr_loss(PhotoRender(predicted, None, None, None), target, LossConfig(ssim_weight=0.0))
@@ -177,16 +137,6 @@ def test_the_mu_law_weighs_shadows_as_the_metric_does(bits):
     assert loss.item() == pytest.approx(expected.item(), rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    "name, code",
-    [("srgb", 8), ("hdr-nerf", 8), ("linear", 8), ("gain-map", 0.5), ("colour:S-Log3", 8 + 255 * 95 / 1023)],
-)
-def test_the_knee_is_at_its_code_above_black(name, code):
-    response = response_by_name(name)
-    knee = response.white / mu_of_knee(response)
-    assert float(response.encode(knee)) * 255 == pytest.approx(code, rel=1e-3)
-
-
 def test_truth_supervises_the_base_and_without_it_there_may_be_nothing_to_compare():
     base, truth = images(2)
     photo = PhotoRender(base, torch.zeros_like(base), base, None)
@@ -217,3 +167,51 @@ def test_the_size_loss_is_the_mean_size_and_its_gradient_is_exact(device, reserv
     # The one without bound stays: its size is not that of its parameter.
     torch.testing.assert_close(gradient[2:40].cpu(), exact.grad[2:].float(), rtol=1e-5, atol=0)
     assert gradient.isfinite().all() and not gradient[:2].any() and not gradient[40:].any()
+
+
+def test_the_hdr_loss_compares_in_the_mu_law():
+    exposure, truth = (4 * image for image in images())
+    config = LossConfig(form="blend", hdr_weight=1.0)
+    target = target_of(truth / 4, truth=truth, clipping=False)
+    loss = hdr_loss(PhotoRender(exposure, exposure, exposure, None), target, config, 4.0)
+    a, b = ((1 + 5000 * x / 4).log() / math.log1p(5000) for x in (exposure, truth))
+    assert float(loss) == pytest.approx(float(0.8 * (a - b).abs().mean() + 0.2 * (1 - ssim(a, b))), rel=1e-4)
+
+
+def test_weights_mix_photos_and_truth(scene):
+    encoded, exposure = images(0)
+    photo = PhotoRender(encoded, 4 * exposure, 4 * exposure, None)
+    encoded, truth = images(1)
+    target = target_of(encoded, truth=4 * truth, clipping=False)
+    field = make_trainer(scene, quick()).field
+
+    def loss(**weights):
+        return float(data_loss(field, photo, target, LossConfig(clipping=False, **weights), 4.0))
+
+    ldr, hdr = loss(), loss(ldr_weight=0.0, hdr_weight=1.0)
+    assert loss(ldr_weight=2.0, hdr_weight=0.6) == pytest.approx(2 * ldr + 0.6 * hdr, rel=1e-5)
+    # A view without truth has its photo alone.
+    target = dataclasses.replace(target, exposure_truth=None)
+    assert loss(hdr_weight=0.6) == pytest.approx(ldr)
+
+
+def test_photos_of_no_weight_teach_nothing(scene):
+    views = tuple(dataclasses.replace(view, codes=view.codes[::-1].copy()) for view in scene.views)
+    config = quick("truth", **{"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0})
+    trainers = [make_trainer(scene, config), make_trainer(dataclasses.replace(scene, views=views), config)]
+    for trainer in trainers:
+        for _ in range(5):
+            trainer.step()
+    first, second = (trainer.field.gaussians.tensors() for trainer in trainers)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_the_anchor_holds_the_unit_exposure_of_a_learned_tone_mapper():
+    mapper = ToneMapper(8, seed=1)
+    loss = anchor_loss(mapper)
+    expected = (mapper.encode(torch.ones(1, 3)) - 0.5).square().mean()
+    assert loss.item() == pytest.approx(expected.item(), abs=1e-6)
+    loss.backward()
+    gradients = [parameter.grad for parameter in mapper.parameters() if parameter.grad is not None]
+    assert all(torch.isfinite(gradient).all() for gradient in gradients)
+    assert mapper.biases[-1].grad.abs().min() > 0

@@ -1,24 +1,14 @@
 """Points matched between photos lie on what the photos show, and errors are where Gaussians are born."""
 
-import gc
-import math
-import weakref
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer.ops.plane_sweep import BORDER
 from sehdr_warp.response import response_by_name
-from sehdr_warp.runs.config_files import load_config
-from sehdr_warp.splats.arrays import HARMONIC_0
-from sehdr_warp.training.initialization import make_field, make_matcher, start_count, start_points
-from sehdr_warp.training.seeding import make_seeds
-from sehdr_warp.training.train import create_trainer, train
-from sehdr_warp.training.training_views import ViewDataset
+from sehdr_warp.training.initialization import make_matcher
 
 from .wall_and_lamp import LAMP, WALL, wall_and_lamp
 
@@ -74,92 +64,3 @@ def test_pixels_repeat_and_avoid_borders_and_masks(device):
     assert torch.equal(pixels, again) and (pixels[:, 1] >= 32).all()
     assert pixels[:, 1:].min() >= BORDER and pixels[:, 1:].max() < 64 - BORDER
     assert 150 < len(pixels) < 500 and set(pixels[:, 0].tolist()) == set(range(9))
-
-
-def never():
-    raise AssertionError("nothing is to be matched")
-
-
-def test_start_points_are_the_scenes_and_matched_ones():
-    scene, config = wall_and_lamp(), load_config("default", {"model.initial_density": 4.0})
-    assert start_count(config, 9 * 64 * 64) == 768
-    own = np.array([[0.0, 0.0, 3.0]] * 300)
-    inputs = replace(scene, points=own, point_colors=np.full((300, 3), 0.5, np.float32))
-    points, colors = start_points(
-        inputs, config, partial(make_matcher, inputs, LINEAR, "cpu"), np.random.default_rng(0)
-    )
-    assert 300 < len(points) == len(colors) <= 800 and np.array_equal(points[:300], own)
-    none = load_config("default", {"model.initial_density": 0.0})
-    assert len(start_points(inputs, none, never, np.random.default_rng(0))[0]) == 300
-    # Without any, they are drawn where cameras look.
-    assert len(start_points(scene, none, never, np.random.default_rng(0))[0]) == 5000
-
-
-def test_a_training_frees_the_matcher_after_the_last_refinement(tmp_path):
-    fields = {"schedule.iterations": 90, "plan.enabled": False}
-    trainer = create_trainer(wall_and_lamp(), tmp_path / "run", load_config("default", fields), device="cpu")
-    matcher, was_over = weakref.ref(trainer._get_matcher()), []
-    for step in trainer:
-        was_over.append(trainer.strategy.schedule.is_over(step.iteration))
-        if was_over[-1] and matcher() is not None:
-            gc.collect()  # It takes a tenth of a second.
-        assert (matcher() is None) == was_over[-1]
-    assert was_over[-1] and not was_over[0]
-
-
-def test_gaussians_are_born_where_the_photos_are_not_explained(device):
-    """A field that shows the wall alone: what is born is the lamp."""
-    scene = wall_and_lamp()
-    config = load_config("default", {"mcmc.seed_fraction": 0.5, "schedule.iterations": 300})
-    dark = [replace(v, codes=np.where(v.codes.min(2, keepdims=True) > 250, np.uint8(77), v.codes)) for v in scene.views]
-    wall = replace(scene, views=tuple(dark))
-    field = make_field(wall, config, LINEAR, device)
-    normalized = field.normalization.scene(scene)
-    views = ViewDataset(normalized.train_views, field.base_time, device, truth=False)
-    matcher = make_matcher(normalized, LINEAR, device)
-    with torch.no_grad():
-        # Opaque, so that the wall is explained from the start.
-        field.gaussians.opacity_logits.fill_(4.0)
-        photo = field.render_photo(views[0].camera, views[0].exposure_time, degree=0).encoded
-    budget = torch.tensor(200, device=device)
-    inputs = field, matcher, photo, views[0], 0
-    (rows, born), (again, roomy) = (make_seeds(*inputs, budget, room, random_seed=3) for room in (200, 300))
-    assert 0 < int(born) < 200 and born == roomy
-    rows, again = ({name: values[: int(born)] for name, values in each.items()} for each in (rows, again))
-    assert all(torch.equal(values, again[name]) for name, values in rows.items())
-    assert all(values.isfinite().all() for values in rows.values())
-    none = make_seeds(*inputs, torch.tensor(0, device=device), 10, random_seed=3)
-    assert not int(none[1])
-    white = rows["harmonics_dc"].amax((1, 2)) == rows["harmonics_dc"].max()
-    depth = torch.from_numpy(field.normalization.scene_points(rows["means"][white].cpu().numpy())[:, 2])
-    assert white.float().mean() > 0.3 and ((depth - LAMP).abs() < 0.15 * LAMP).float().mean() > 0.6
-    assert {name: tuple(values.shape[1:]) for name, values in rows.items()} == {
-        name: tuple(values.shape[1:]) for name, values in field.gaussians.tensors().items()
-    }
-    # White ones are born at the light that the photo is expected to hold.
-    held = torch.full((16, 16, 6), math.log(50), dtype=torch.float16, device=device)
-    lit = replace(views[0], target=replace(views[0].target, estimates=held))
-    brighter = make_seeds(field, matcher, photo, lit, 0, budget, 200, random_seed=3).rows["harmonics_dc"]
-    rise = (brighter[: int(born)] - rows["harmonics_dc"])[:, 0] * HARMONIC_0
-    torch.testing.assert_close(rise, math.log(50) * white[:, None].expand_as(rise), rtol=2e-3, atol=1e-5)
-
-
-def test_a_scene_of_two_photos_or_of_none_that_match_still_starts(tmp_path):
-    scene = wall_and_lamp()
-    two = replace(scene, views=scene.views[:2])
-    config = load_config("default", {"schedule.iterations": 3, "plan.enabled": False, "response.name": "linear"})
-    assert train(two, tmp_path / "two", config, device="cpu").summary()["iteration"] == 3
-    rng = np.random.default_rng(0)
-    noise = tuple(replace(v, codes=rng.integers(0, 256, v.codes.shape, dtype=np.uint8)) for v in scene.views)
-    assert train(replace(scene, views=noise), tmp_path / "noise", config, device="cpu").summary()["iteration"] == 3
-
-
-def test_back_to_back_photos_are_refused(tmp_path):
-    scene = wall_and_lamp()
-    turned = scene.views[1].camera.world_to_camera.copy()
-    turned[[0, 2]] *= -1
-    other = replace(scene.views[1], camera=replace(scene.views[1].camera, world_to_camera=turned))
-    two = replace(scene, views=(scene.views[0], other))
-    config = load_config("default", {"plan.enabled": False, "response.name": "linear"})
-    with pytest.raises(SehdrError, match="no two training cameras"):
-        train(two, tmp_path / "run", config, device="cpu")

@@ -37,20 +37,6 @@ def fields(plan):
     return {path: value for decision in plan.decisions for path, value in decision.fields.items()}
 
 
-@pytest.fixture(scope="module")
-def facts(scene):
-    return measure_scene(scene)
-
-
-def test_facts_are_those_of_the_scene(scene, facts):
-    assert (facts.photos, facts.truths) == (6, 6)
-    assert facts.pixels == 6 * 32 * 32 and facts.points == len(scene.points) == 60
-    # Cameras on a full circle see most of a cloud in its middle.
-    assert facts.overlap > 0.5 and facts.visibility > 4
-    clipped = [(view.image >= 254.5 / 255).any(2).mean() for view in scene.train_views]
-    assert facts.clipped == pytest.approx(float(np.mean(clipped)))
-
-
 def test_a_plan_decides_everything_once_with_figures(scene):
     plan = make_plan(scene, config_of())
     assert [decision.name for decision in plan.decisions] == list(RULES)
@@ -118,34 +104,6 @@ def test_photos_that_clip_get_a_line_before_the_training(scene, clipped, is_told
     assert not tells(clipped_when_dark=0.001) and not tells(unclipped=True)
     lines = replace(plan, facts=replace(plan.facts, clipped=0.3, clipped_when_dark=0.065)).lines()
     assert any("the darkest photos clip, too (6.5% of their pixels)" in line for line in lines)
-
-
-def test_brackets_clip_as_much_as_their_darkest_photos(scene):
-    views = [
-        replace(view, exposure_time=time, codes=codes_of(np.clip(time * view.image, 0, 1)))
-        for view, time in zip(scene.views, [0.25, 1.0, 9.0] * len(scene.views), strict=False)
-    ]
-    facts = measure_scene(replace(scene, views=tuple(views)))
-    assert facts.clipped_when_dark < 0.01 < facts.clipped
-    assert measure_scene(scene).clipped_when_dark == measure_scene(scene).clipped
-
-
-def test_facts_count_what_masks_keep(scene):
-    """A subject before a white wall: only the wall clips, and only outside the masks."""
-    wall = np.arange(32)[None, :] < 12
-    views = [
-        replace(
-            view,
-            codes=codes_of(np.where(wall[..., None], 1.0, 0.1 + 0.5 * view.image)),
-            mask=(~wall * np.ones((32, 1)) if masked else np.zeros((32, 32))).astype(np.float32),
-        )
-        for view, masked in zip(scene.views, [True] * (len(scene.views) - 1) + [False], strict=True)
-    ]
-    before = measure_scene(replace(scene, views=tuple(replace(view, mask=None) for view in views)))
-    facts = measure_scene(replace(scene, views=tuple(views)))
-    assert before.clipped == before.clipped_when_dark == 12 / 32
-    assert facts.clipped == facts.clipped_when_dark == facts.plateau == 0
-    assert 0 < facts.contrast < before.contrast
 
 
 def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):

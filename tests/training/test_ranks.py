@@ -1,33 +1,24 @@
 """Trainings on two ranks: alike in every bit, about as good as one, and ended together whatever happens to one."""
 
-import math
 import os
 import signal
 import sys
 import threading
 import time
 from multiprocessing import active_children
-from types import SimpleNamespace
 
 import pytest
 import torch
 from torch.multiprocessing import ProcessExitedException
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.rasterizer import HarmonicsGradients
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.training.cost import gain_of_ranks
-from sehdr_warp.training.flat_gradients import FlatGradients
-from sehdr_warp.training.launch import device_of_rank
-from sehdr_warp.training.optimizer import load_optimizer_tensors, make_optimizer, optimizer_tensors
-from sehdr_warp.training.ranks import END, WAIT
-from sehdr_warp.training.strategies import make_strategy
+from sehdr_warp.training.ranks import rank_timeout
 from sehdr_warp.training.train import train
 
 from ..refusals import call
 from . import team
-from .toy import VARIANTS, make_trainer, toy_field, toy_scene
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="ranks share photos through Linux's /proc")
 
@@ -124,80 +115,8 @@ def test_a_signal_saves_and_ends_all(command, tmp_path):
     assert load_run(tmp_path / "run").iterations > 0
 
 
-def test_rates_and_decays_follow_the_batch():
-    config, field = VARIANTS["adc"], toy_field()
-    one, four = (make_optimizer(field, config, batch) for batch in (1, 4))
-    for a, b in zip(one.param_groups, four.param_groups, strict=True):
-        assert b["lr"] == pytest.approx(2 * a["lr"])
-    assert four.betas == pytest.approx([beta**4 for beta in one.betas])
-    field.gaussians.means.grad = torch.ones_like(field.gaussians.means)
-    four.step()
-    saved = optimizer_tensors(four, 4)
-    assert saved["means.0.step"] == 4
-    load_optimizer_tensors(one, saved, 1)
-    assert one.state[field.gaussians.means]["step"] == 4
-
-
-def test_gradients_go_through_one_buffer():
-    field = toy_field()
-    optimizer = make_optimizer(field, VARIANTS["adc"])
-    flat, gradients = FlatGradients(optimizer, 0, 1, defer_sh=False), {}
-    for name in ("means", "opacity_logits"):
-        parameter = getattr(field.gaussians, name)
-        gradients[name] = parameter.grad = torch.randn_like(parameter)
-    flat.collect(torch.tensor(2.0), torch.tensor(True))
-    assert flat.fits(optimizer) and field.gaussians.means.grad is None
-    flat.buffer.mul_(0.5)
-    loss, overflow, harmonics = flat.distribute()
-    assert harmonics is None and loss == 1 and bool(overflow) and field.gaussians.quaternions.grad is None
-    for name, gradient in gradients.items():
-        assert torch.equal(getattr(field.gaussians, name).grad, gradient / 2)
-    field.gaussians.quaternions.grad = torch.ones_like(field.gaussians.quaternions)
-    with pytest.raises(AssertionError, match="gradients of the same parameters"):
-        flat.collect(torch.tensor(2.0), None)
-    field.gaussians.resize(70, optimizer)
-    assert not flat.fits(optimizer) and field.gaussians.count == 70
-
-
-def test_harmonics_go_as_their_factors():
-    field, count = toy_field(), 3
-    optimizer, means = make_optimizer(field, VARIANTS["adc"]), field.gaussians.means
-    ranks = [FlatGradients(optimizer, place, count, defer_sh=True) for place in range(count)]
-    factors = [HarmonicsGradients(torch.randn(1, len(means), 3), torch.randn(1, 3), means, 1) for _ in ranks]
-    for flat, harmonics in zip(ranks, factors, strict=True):
-        means.grad = torch.ones_like(means)
-        flat.collect(torch.tensor(2.0), None, harmonics)
-    ranks[1].buffer.copy_(torch.stack([flat.buffer for flat in ranks]).mean(0))
-    _, _, harmonics = ranks[1].distribute()
-    assert harmonics.degree == 1 and ranks[1].buffer.numel() < 4 * count * means.numel() + 11 * len(means)
-    assert torch.allclose(harmonics.grad_colors, torch.cat([one.grad_colors for one in factors]) / count)
-    assert torch.allclose(harmonics.positions, torch.cat([one.positions for one in factors]))
-
-
-@pytest.mark.parametrize("photos", [1, 2, 3, 8])
-def test_each_change_happens_once_whatever_the_stride(photos):
-    strategy = make_strategy(VARIANTS["default"], 1000)
-    due = [n for n in range(photos, 91, photos) if strategy.is_due(n, photos)]
-    assert [n // 25 for n in due] == [1, 2, 3] and (strategy.schedule.start, strategy.schedule.stop) == (20, 80)
-
-
-def test_small_scenes_are_told_that_they_gain_nothing():
-    gpu = torch.device("cuda", 0)
-    assert "too few to gain" in gain_of_ranks(2, 2_000, 10_000, 4000, gpu)
-    large = gain_of_ranks(2, 1_000_000, 2_000_000, 30_000, gpu)
-    assert "estimated 1." in large and "too few" not in large
-    assert "no faster than one" in gain_of_ranks(2, 1_000_000, 2_000_000, 30_000, torch.device("cpu"))
-    assert math.isfinite(float(gain_of_ranks(8, 10**6, 10**6, 10**4, gpu).split("estimated ")[1].split()[0]))
-
-
-def test_a_processor_takes_no_thousands_of_ranks():
-    assert device_of_rank(1, "cpu").type == "cpu"
-    with pytest.raises(SehdrError, match="100000 ranks on .* processors"):
-        device_of_rank(99_999, "cpu")
-
-
-def test_ranks_that_end_during_a_pause_are_not_asked_again():
-    trainer, signals = make_trainer(toy_scene(), VARIANTS["default"]), []
-    trainer.ranks = SimpleNamespace(all_reduce_min=lambda signal: signals.append(signal) or END)
-    trainer.keep_ranks_waiting()
-    assert trainer.ending and not trainer._agree_to_continue() and signals == [WAIT]
+@pytest.mark.parametrize("seconds", ["nan", "-1", "x", "inf"])
+def test_times_that_cannot_be_are_refused(monkeypatch, seconds):
+    monkeypatch.setenv("SEHDR_RANK_TIMEOUT", seconds)
+    with pytest.raises(SehdrError, match=f"SEHDR_RANK_TIMEOUT = {seconds} is not a number of seconds"):
+        rank_timeout()

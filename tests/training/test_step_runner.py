@@ -9,7 +9,7 @@ from sehdr_warp.errors import SehdrError
 from sehdr_warp.rasterizer.ops.step_updates import decide_step
 from sehdr_warp.training.step_runner import HEADROOM, MIN_CAPACITY, MIN_SHRINK, GraphCapacity
 
-from .recorded import check_recorded_like_launched
+from .recorded import check_recorded_like_launched, train_on_gpu
 from .toy import VARIANTS, make_trainer, quick, toy_scene
 
 MANY = 10 * MIN_CAPACITY
@@ -103,3 +103,10 @@ def test_a_step_that_cannot_be_recorded_ends_the_training_with_a_way_out(scene, 
 @pytest.mark.parametrize("variant", ["default", "adc", "dropout"])
 def test_recorded_steps_train_like_launched_ones(variant):
     check_recorded_like_launched(toy_scene(), VARIANTS[variant], 60)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need a GPU")
+@pytest.mark.parametrize("name", ["hdr-gs-truth", "gauss-hdr", "truth"])
+def test_rivals_are_recorded_on_a_gpu(scene, name):
+    _, replays = train_on_gpu(scene, VARIANTS[name], iterations=90)
+    assert replays > 50

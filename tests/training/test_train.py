@@ -1,17 +1,15 @@
 """Whole trainings of seconds: they learn, they report, they stop tidily, and they refuse what cannot work."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
-from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import codes_of
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.run_output import evaluate_views
@@ -37,17 +35,6 @@ def test_every_variant_learns_and_loads_as_it_was_trained(scene, trained, varian
     again = evaluate_views(run.field, scene.test_views, run.config.model.sh_degree)
     assert again["psnr_ldr"] == pytest.approx(last["psnr_ldr"], abs=1e-4)
     assert np.isfinite(run.render(run.cameras[0].camera).hdr.numpy()).all()
-
-
-@pytest.mark.parametrize(
-    ("every", "keep", "saved"), [(5000, [], 2), (5001, [], 7), (5000, ["schedule.checkpoint_every"], 7)]
-)
-def test_checkpoints_are_seconds_apart_unless_their_interval_is_set(scene, tmp_path, every, keep, saved):
-    """The default of 5000 iterations of 30,000 are 2 of 12 here; one more is of the start."""
-    fields = {"schedule.keep_checkpoints": 9, "schedule.checkpoint_every": every, "plan.keep": keep}
-    train(scene, tmp_path / "run", override_config(quick(length=12), fields), device="cpu")
-    names = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
-    assert len(names) == saved and names[-1] == "iteration_00000012", names
 
 
 @pytest.mark.parametrize("options", [{}, {"mcmc.cap_density": 0.1}, {"densification.cap_max": 50}])
@@ -145,28 +132,6 @@ def test_seeds_decide_and_global_state_does_not(scene, tmp_path):
     assert results[2].shape != results[0].shape or not torch.equal(results[0], results[2])
 
 
-def test_wide_codes_are_intervals_in_the_last_part_alone(scene):
-    config = quick(length=20)
-    trainer = make_trainer(scene, config)
-    widths = []
-    for _ in range(20):
-        trainer.step()
-        table = trainer.data_manager.views[0].target.scale.table[1:-1]
-        widths.append(float((table[:, 2] - table[:, 1]).max()))
-    assert max(widths[:17]) == 0 < min(widths[17:])
-
-
-def test_opacities_are_not_pulled_down_once_none_are_relocated(scene):
-    config = quick(length=60, **{"densification.refine_stop_iter": 40, "loss.opacity_weight": 10.0})
-    trainer = make_trainer(scene, config)
-    means = []
-    for _ in trainer:
-        means.append(float(trainer.field.gaussians.opacities().detach().mean()))
-    last_refinement = next(i for i in range(60) if trainer.strategy.schedule.is_over(i))
-    assert 20 < last_refinement < 40
-    assert means[last_refinement - 1] < 0.5 * means[0] and means[-1] > means[last_refinement - 1]
-
-
 @pytest.mark.parametrize("large", [True, False])
 def test_new_gaussians_of_a_large_scene_do_not_fade_before_a_photo_shows_them(scene, device, large):
     config = quick(length=60, **{"densification.refine_start_iter": 55, "loss.opacity_weight": 10.0})
@@ -224,25 +189,6 @@ def test_gradients_by_harmonics_as_factors_make_the_same_steps(scene, device, va
         assert apart.float().mean() < (0.02 if device.startswith("cuda") else 1e-3), name
 
 
-def test_non_finite_steps_are_skipped_and_then_stop(scene):
-    config = quick(**{"mcmc.noise_lr": 0.0})
-    trainer = make_trainer(scene, config)
-    field = trainer.field
-    trainer.step()
-    before = field.gaussians.means.detach().clone()
-    hook = field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * float("nan"))
-    trainer.step()
-    assert trainer.skipped_steps == 1 and torch.equal(before, field.gaussians.means)
-    hook.remove()
-    trainer.step()
-    assert trainer.skipped_steps == 1 and not torch.equal(before, field.gaussians.means)
-    field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * float("inf"))
-    with pytest.raises(SehdrError, match="iteration 40: .*more than 20"):
-        for _ in range(60):
-            trainer.step()
-    assert torch.isfinite(field.gaussians.means).all()
-
-
 @pytest.mark.parametrize("value,words", [(0.0, "black"), (1.0, "white")])
 def test_photos_without_light_or_shadow_are_refused(scene, tmp_path, value, words):
     views = tuple(replace(view, codes=codes_of(np.full_like(view.image, value))) for view in scene.views)
@@ -269,77 +215,6 @@ def test_unknown_device_is_refused(scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_tensorboard_gets_the_figures_of_the_last_training_in_a_folder(scene, tmp_path, monkeypatch):
-    short = quick(**{"schedule.iterations": 4})
-    with monkeypatch.context() as without:
-        without.setitem(sys.modules, "torch.utils.tensorboard", None)
-        with pytest.raises(SehdrError, match=r"pip install 'sehdr-warp\[tensorboard\]'"):
-            train(scene, tmp_path / "without", short, device="cpu", tensorboard=True)
-    assert not (tmp_path / "without").exists()
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    train(scene, tmp_path / "run", quick(length=6), device="cpu", tensorboard=True)
-    notes = tmp_path / "run" / "tensorboard" / "notes.txt"
-    notes.write_text("mine")
-    run = train(scene, tmp_path / "run", short, device="cpu", tensorboard=True, overwrite=True)
-    figures = [
-        (event.step, event.value) for event in EventAccumulator(str(notes.parent)).Reload().Scalars("test/psnr_ldr")
-    ]
-    assert figures == [(line["iteration"], pytest.approx(line["psnr_ldr"], abs=1e-3)) for line in run.metrics()]
-    assert notes.read_text() == "mine"
-
-
-def test_held_out_figures_are_told_in_words(scene, tmp_path, logged):
-    short = quick(**{"schedule.iterations": 4})
-    last = train(scene, tmp_path / "run", short, device="cpu").metrics()[-1]
-    figures = f"held-out photos {last['psnr_ldr']:.1f} dB, HDR {last['psnr_mu']:.1f} dB (mu-law)"
-    assert any(line.startswith(f"iteration 4: {figures}, after ") for line in logged)
-
-
-@pytest.mark.parametrize("excluded", [(3,), (3, 7)])
-def test_held_out_photos_that_a_mask_excludes_have_no_figures(scene, tmp_path, excluded):
-    nothing = np.zeros((32, 32), np.float32)
-    views = tuple(replace(view, mask=nothing) if k in excluded else view for k, view in enumerate(scene.views))
-    run = train(replace(scene, views=views), tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
-    assert bool(run.metrics()) == (len(excluded) == 1), "NaN would be left out by every reader"
-
-
-def test_a_training_is_driven_step_by_step_and_left_at_any_time(scene, tmp_path):
-    training = create_trainer(scene, tmp_path / "run", quick(), device="cpu")
-    progress_lines = []
-    for step in training:
-        progress_lines.append((step.iteration, step.seconds, step.seconds_left))
-        if step.iteration == 12:
-            before = training.seconds
-            assert step.psnr > 5 and training.seconds == before, "a render for the display is no training"
-            assert step.loss > 0 and step.gaussians >= 60 and step.total == 90
-            break
-    assert [iteration for iteration, *_ in progress_lines] == list(range(1, 13))
-    assert progress_lines[0][2] is None and 0 < progress_lines[-1][2] < 78 * (
-        progress_lines[-1][1] - progress_lines[0][1]
-    )
-    assert training.run.iterations == 12 and not training.run.summary()["finished"]
-    training = create_trainer(scene, tmp_path / "run", device="cpu", resume=True)
-    for step in training:
-        if step.iteration == 20:
-            before = training.run.iterations
-            training.stop()
-    assert before == 12, "a checkpoint every 30 iterations"
-    assert load_run(tmp_path / "run").iterations == training.run.iterations == 20
-    assert not RunFolder(tmp_path / "run").confidence.exists(), "that of an earlier checkpoint would not fit"
-
-
-def test_a_loop_that_is_left_after_the_last_step_ends_as_one_that_is_not(scene, tmp_path):
-    trainer = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
-    for progress in trainer:
-        if progress.iteration == progress.total:
-            break
-    run, saved = trainer.run, load_run(tmp_path / "run")
-    assert run.summary()["finished"] and run.field.confidence is not None
-    assert torch.equal(run.clipped_share(), saved.clipped_share()), "lights are found in a run as it was trained"
-
-
 @pytest.mark.parametrize("config", ["demo", {"schedule.iterations": 3, "response.name": "srgb"}, 7])
 def test_a_config_may_be_a_name_or_fields(scene, tmp_path, config):
     if config == 7:
@@ -348,24 +223,3 @@ def test_a_config_may_be_a_name_or_fields(scene, tmp_path, config):
         return
     training = create_trainer(scene, tmp_path / "run", config, device="cpu")
     assert training.total == (700 if config == "demo" else 3)
-
-
-def test_a_finished_trainer_is_evaluated_once(scene, tmp_path):
-    trainer = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
-    metrics = trainer.train().metrics()
-    assert trainer.train().metrics() == metrics
-
-
-def test_a_trainer_that_was_stepped_to_its_end_is_finished_by_train(scene, tmp_path):
-    trainer = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
-    for _ in range(4):
-        trainer.step()
-    run = trainer.train()
-    assert run.metrics()[-1]["iteration"] == 4 and run.summary()["finished"] and run.field.confidence is not None
-
-
-def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
-    training = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
-    training.output.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
-    training.train()
-    assert "held-out photos scored best at iteration 2 (99.00 dB), now" in caplog.text

@@ -1,20 +1,76 @@
-"""A training that diverges: what is skipped, what is saved, and where it goes on."""
+"""What a training writes beside its state: figures, checkpoints, lines."""
 
 import dataclasses
+import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
+from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.training import gradient_step
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
-from sehdr_warp.training.training_state import state_of
 
-from .toy import load_unscaled, make_trainer
+from .toy import load_unscaled, quick
+
+
+@pytest.mark.parametrize(
+    ("every", "keep", "saved"), [(5000, [], 2), (5001, [], 7), (5000, ["schedule.checkpoint_every"], 7)]
+)
+def test_checkpoints_are_seconds_apart_unless_their_interval_is_set(scene, tmp_path, every, keep, saved):
+    """The default of 5000 iterations of 30,000 are 2 of 12 here; one more is of the start."""
+    fields = {"schedule.keep_checkpoints": 9, "schedule.checkpoint_every": every, "plan.keep": keep}
+    train(scene, tmp_path / "run", override_config(quick(length=12), fields), device="cpu")
+    names = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
+    assert len(names) == saved and names[-1] == "iteration_00000012", names
+
+
+def test_tensorboard_gets_the_figures_of_the_last_training_in_a_folder(scene, tmp_path, monkeypatch):
+    short = quick(**{"schedule.iterations": 4})
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "torch.utils.tensorboard", None)
+        with pytest.raises(SehdrError, match=r"pip install 'sehdr-warp\[tensorboard\]'"):
+            train(scene, tmp_path / "without", short, device="cpu", tensorboard=True)
+    assert not (tmp_path / "without").exists()
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    train(scene, tmp_path / "run", quick(length=6), device="cpu", tensorboard=True)
+    notes = tmp_path / "run" / "tensorboard" / "notes.txt"
+    notes.write_text("mine")
+    run = train(scene, tmp_path / "run", short, device="cpu", tensorboard=True, overwrite=True)
+    figures = [
+        (event.step, event.value) for event in EventAccumulator(str(notes.parent)).Reload().Scalars("test/psnr_ldr")
+    ]
+    assert figures == [(line["iteration"], pytest.approx(line["psnr_ldr"], abs=1e-3)) for line in run.metrics()]
+    assert notes.read_text() == "mine"
+
+
+def test_held_out_figures_are_told_in_words(scene, tmp_path, logged):
+    short = quick(**{"schedule.iterations": 4})
+    last = train(scene, tmp_path / "run", short, device="cpu").metrics()[-1]
+    figures = f"held-out photos {last['psnr_ldr']:.1f} dB, HDR {last['psnr_mu']:.1f} dB (mu-law)"
+    assert any(line.startswith(f"iteration 4: {figures}, after ") for line in logged)
+
+
+@pytest.mark.parametrize("excluded", [(3,), (3, 7)])
+def test_held_out_photos_that_a_mask_excludes_have_no_figures(scene, tmp_path, excluded):
+    nothing = np.zeros((32, 32), np.float32)
+    views = tuple(replace(view, mask=nothing) if k in excluded else view for k, view in enumerate(scene.views))
+    run = train(replace(scene, views=views), tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
+    assert bool(run.metrics()) == (len(excluded) == 1), "NaN would be left out by every reader"
+
+
+def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
+    training = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
+    training.output.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
+    training.train()
+    assert "held-out photos scored best at iteration 2 (99.00 dB), now" in caplog.text
 
 
 def config(**overrides):
@@ -76,22 +132,3 @@ def test_the_last_state_is_saved_though_its_step_was_skipped(scene, tmp_path, mo
     assert trainer.skipped_steps == 1 and run.iterations == end
     assert run.gaussian_count == (65 if end == 15 else 60)
     assert end == 15 or run.metrics()[-1]["gaussians"] == 60, "the last score is that of the saved Gaussians"
-
-
-def test_huge_gradients_leave_finite_parameters(scene):
-    """A gradient too large to be squared in float32 would freeze Adam's second moment at infinity."""
-
-    options = config()
-    trainer = make_trainer(scene, options)
-    field = trainer.field
-    factor = [1e36]
-    field.gaussians.harmonics_dc.register_hook(lambda gradient: gradient * factor[0])
-    trainer.step()
-    assert trainer.skipped_steps == 1
-    factor[0] = 1.0
-    before = field.gaussians.harmonics_dc.detach().clone()
-    trainer.step()
-    assert trainer.skipped_steps == 1 and not torch.equal(before, field.gaussians.harmonics_dc)
-    assert all(
-        bool(tensor.isfinite().all()) for tensor in state_of(trainer).tensors.values() if tensor.is_floating_point()
-    )

@@ -1,0 +1,28 @@
+"""The schedule of changes: when they are due, and how many Gaussians there are then."""
+
+import pytest
+
+from sehdr_warp.runs.config_files import load_config
+from sehdr_warp.training.strategies import make_strategy
+
+from ..toy import VARIANTS
+
+
+@pytest.mark.parametrize("iterations", [300, 1500, 30_000])
+def test_a_training_of_any_length_reaches_its_budget(iterations):
+    strategy = make_strategy(load_config("default", {"schedule.iterations": iterations}), 10**6)
+    assert strategy.cap_max == 120_000
+    count = 5000
+    for iteration in range(1, iterations + 1):
+        if strategy.is_due(iteration):
+            growth = strategy.next_count(iteration, count) / count
+            assert iterations < 30_000 or growth <= 1.05 + 1 / count
+            count = strategy.next_count(iteration, count)
+    assert count == 120_000
+
+
+@pytest.mark.parametrize("photos", [1, 2, 3, 8])
+def test_each_change_happens_once_whatever_the_stride(photos):
+    strategy = make_strategy(VARIANTS["default"], 1000)
+    due = [n for n in range(photos, 91, photos) if strategy.is_due(n, photos)]
+    assert [n // 25 for n in due] == [1, 2, 3] and (strategy.schedule.start, strategy.schedule.stop) == (20, 80)

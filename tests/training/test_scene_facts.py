@@ -1,0 +1,46 @@
+"""What is measured of a scene before its training."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sehdr_warp.scene import codes_of
+from sehdr_warp.training.scene_facts import measure_scene
+
+
+def test_facts_are_those_of_the_scene(scene, facts):
+    assert (facts.photos, facts.truths) == (6, 6)
+    assert facts.pixels == 6 * 32 * 32 and facts.points == len(scene.points) == 60
+    # Cameras on a full circle see most of a cloud in its middle.
+    assert facts.overlap > 0.5 and facts.visibility > 4
+    clipped = [(view.image >= 254.5 / 255).any(2).mean() for view in scene.train_views]
+    assert facts.clipped == pytest.approx(float(np.mean(clipped)))
+
+
+def test_brackets_clip_as_much_as_their_darkest_photos(scene):
+    views = [
+        replace(view, exposure_time=time, codes=codes_of(np.clip(time * view.image, 0, 1)))
+        for view, time in zip(scene.views, [0.25, 1.0, 9.0] * len(scene.views), strict=False)
+    ]
+    facts = measure_scene(replace(scene, views=tuple(views)))
+    assert facts.clipped_when_dark < 0.01 < facts.clipped
+    assert measure_scene(scene).clipped_when_dark == measure_scene(scene).clipped
+
+
+def test_facts_count_what_masks_keep(scene):
+    """A subject before a white wall: only the wall clips, and only outside the masks."""
+    wall = np.arange(32)[None, :] < 12
+    views = [
+        replace(
+            view,
+            codes=codes_of(np.where(wall[..., None], 1.0, 0.1 + 0.5 * view.image)),
+            mask=(~wall * np.ones((32, 1)) if masked else np.zeros((32, 32))).astype(np.float32),
+        )
+        for view, masked in zip(scene.views, [True] * (len(scene.views) - 1) + [False], strict=True)
+    ]
+    before = measure_scene(replace(scene, views=tuple(replace(view, mask=None) for view in views)))
+    facts = measure_scene(replace(scene, views=tuple(views)))
+    assert before.clipped == before.clipped_when_dark == 12 / 32
+    assert facts.clipped == facts.clipped_when_dark == facts.plateau == 0
+    assert 0 < facts.contrast < before.contrast
