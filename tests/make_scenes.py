@@ -177,3 +177,12 @@ def write_room(folder: Path, shared: Path, *, points: bool = True, **options) ->
             cloud = stored["xyz"], reinhard_gamma(stored["radiance"] * times[2])
     write_reinhard(folder, views, times, points=cloud)
     return times
+
+
+def said(scene, word):
+    return [note for note in scene.notes if word in note]
+
+
+def edit_transforms(folder, **fields):
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))

@@ -295,7 +295,7 @@ def _with_splits(
     if holdout is None and any(record.split == "test" for record in records):
         return [replace(record, split=record.split or "train") for record in records], copies
     uncertain = {i for i, record in enumerate(records) if record.uncertain}
-    held_out = _held_out(len(records), holdout, dataset.holdout, uncertain)
+    held_out = holdout_indices(len(records), holdout, dataset.holdout, uncertain)
     records = [replace(record, split="test" if i in held_out else "train") for i, record in enumerate(records)]
     if not held_out:
         return records, [*copies, "no views are held out for testing"]
@@ -305,7 +305,7 @@ def _with_splits(
     return records, [*copies, f"{len(names)} of {len(records)} views {are} held out for testing: {names_text}"]
 
 
-def _held_out(
+def holdout_indices(
     count: int, step: int | None, protocol: tuple[int, int] | None, uncertain: Collection[int] = ()
 ) -> set[int]:
     """Return the indices of test views: by `protocol` (every, offset), or the middle of each block, not the last view.

@@ -117,7 +117,7 @@ class PhotoFile:
 _files: weakref.WeakSet[PhotoFile] = weakref.WeakSet()
 
 
-def _file_of(array: np.ndarray) -> PhotoFile | None:
+def file_of(array: np.ndarray) -> PhotoFile | None:
     """Return the file that an array lies in, None if it is in memory."""
     return next((file for file in _files if file.place(array) is not None), None)
 
@@ -141,7 +141,7 @@ class _Pickler(pickle.Pickler):
     def persistent_id(self, obj: Any) -> Any:
         if type(obj) is not np.ndarray or obj.nbytes < _LARGE or obj.dtype.hasobject:
             return None
-        file = _file_of(obj) or self.photos
+        file = file_of(obj) or self.photos
         return file.handle(file.keep(obj))
 
 
@@ -184,7 +184,7 @@ class PhotoKeeper:
             self._decide(self.count * sum(array.nbytes for array in arrays.values()))
         if self.file is None:
             return view
-        return replace(view, **{name: a if _file_of(a) else self.file.keep(a) for name, a in arrays.items()})
+        return replace(view, **{name: a if file_of(a) else self.file.keep(a) for name, a in arrays.items()})
 
     def _decide(self, size: int) -> None:
         free, self.note = available_memory(), ""

@@ -10,7 +10,6 @@ from sehdr_warp.output.images.display import display_gain
 from sehdr_warp.output.render_views import render_views
 from sehdr_warp.own_files import LIST
 from sehdr_warp.scene.exposure.compensation import ExposureCompensation
-from sehdr_warp.scene.file_names import safe_names
 
 from .helpers import AnalyticRun, camera, read_exr
 
@@ -153,13 +152,6 @@ def test_options_that_do_nothing_are_refused(tmp_path):
     entries = [{"name": name, **camera(position=(i, 0, -3)).to_dict()} for i, name in enumerate(("a", "b"))]
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": entries}))
     assert [name for name, _ in select_cameras(AnalyticRun(), tmp_path / "cameras.json")] == ["a", "b"]
-
-
-def test_names_are_safe_and_different():
-    names = ["a/b", "..", "A_B", "a_b", "x" * 300, "con?", "a_b_2", ""]
-    safe = safe_names(names)
-    assert safe == ["a_b", "view", "A_B_3", "a_b_4", "x" * 120, "con_", "a_b_2", "view_2"]
-    assert len({name.casefold() for name in safe}) == len(safe)
 
 
 def test_cameras_that_see_nothing_are_warned_of(tmp_path, logged, monkeypatch):

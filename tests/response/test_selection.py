@@ -8,7 +8,6 @@ from sehdr_warp.response import Response, response_by_name
 from sehdr_warp.response.selection import select_response
 from sehdr_warp.response.selection_scores import FINE, edge_facts, family_curves
 from sehdr_warp.response.table import TabulatedResponse
-from sehdr_warp.scene.response_choice import select_for_codes
 
 from .mosaics import CODES, mosaic, named, photograph, stops_off
 
@@ -54,15 +53,6 @@ def test_uncertainty_is_small_with_edges_and_large_without():
     alone = select_response(photograph("srgb", mosaic()), candidates=named("srgb"))
     assert alone.uncertainty == pytest.approx(0, abs=1e-6)
     assert np.isnan(select_response(photograph("srgb", mosaic()), method="paper").uncertainty)
-
-
-def test_a_guess_is_told():
-    ramp = np.rint(255 * np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))).astype(np.uint8)
-    note = select_for_codes([ramp], [None], "posterior", ()).note
-    assert "is a guess: curves that explain the photos as well differ from it by" in note
-    codes = [np.rint(255 * photograph("srgb", mosaic(seed))).astype(np.uint8) for seed in range(4)]
-    assert select_for_codes(codes, [None] * 4, "posterior", ()).note is None
-    assert select_for_codes(codes, [None] * 4, "paper", ()).note is None
 
 
 def family_curve(draw: int) -> Response:

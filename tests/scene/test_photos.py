@@ -11,7 +11,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.photos import usable_photos
 from sehdr_warp.scene.readers.bare_photos import find_photos
-from tests.make_scenes import pattern, png_of
+from tests.make_scenes import load, pattern, png_of, write_colmap
 
 
 def write(path: Path, aspect: tuple[int, int], seed: int) -> None:
@@ -54,3 +54,35 @@ def test_all_photos_that_cannot_be_used_are_named(tmp_path):
     _, _, notes = usable_photos(find_photos(tmp_path).records)
     assert "5 of 11 photos" in notes[0] and notes[0].count("not square") == 3
     assert notes[0].endswith("; and 3.png, 4.png)")
+
+
+def test_stored_pixels_or_turned_ones_as_the_camera_size_says(tmp_path):
+    for name, size in (("stored", (64, 48)), ("turned", (48, 64))):
+        write_colmap(tmp_path / name, size=size)
+        for i in range(6):
+            exif = Image.Exif()
+            exif[0x0112] = 6
+            Image.fromarray(pattern(64, 48, i)).save(tmp_path / name / "images" / f"{i:03d}.png", exif=exif)
+    stored, turned = (load(tmp_path / name).views[1].image for name in ("stored", "turned"))
+    np.testing.assert_array_equal(np.rot90(stored, -1), turned)
+
+
+def test_images_of_another_shape_than_the_camera_are_left_out(tmp_path):
+    write_colmap(tmp_path)
+    for i in range(3):
+        Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / f"{3 + i:03d}.png")
+    expected = "3 of 6 photos cannot be used and were left out (003.png: image is 60 x 48, its camera 64 x 48; "
+    assert any(note.startswith(expected) for note in load(tmp_path).notes)
+    Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / "000.png")
+    with pytest.raises(InputError, match=r"000.png: image is 60 x 48, its camera 64 x 48"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("size", [(26, 19), (200, 150)])
+def test_images_of_any_size_with_the_shape_of_the_camera(tmp_path, size):
+    write_colmap(tmp_path)
+    for i in range(6):
+        Image.fromarray(pattern(*size, i)).save(tmp_path / "images" / f"{i:03d}.png")
+    camera = load(tmp_path).views[0].camera
+    assert (camera.width, camera.height) == size
+    assert camera.fx == pytest.approx(50 * size[0] / 64) and camera.cy == pytest.approx(25 * size[1] / 48)

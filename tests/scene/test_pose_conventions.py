@@ -2,20 +2,19 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sehdr_warp.scene import load_scene
-from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
-from sehdr_warp.scene.shared_pixels import SharedPixels, candidate_pairs, shared_pixels
+from sehdr_warp.scene.shared_pixels import candidate_pairs, shared_pixels
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
 LARGER = 2  # Times the embedded photos, in which few features are found
 
 
@@ -178,14 +177,6 @@ def test_tiff_photos_are_compared_as_they_are_stored(tmp_path, photos, views):
     check(folder, views, None)
 
 
-def test_photos_of_one_place_are_not_compared():
-    """Pairs of one bracket fit any poses."""
-    thrice = [record for record in parse_dataset("embedded").records[:14] for _ in range(3)]
-    pairs = candidate_pairs(thrice)
-    assert len(pairs) >= 8
-    assert all(i // 3 != j // 3 for i, j in pairs)
-
-
 def test_masked_pixels_are_not_compared(tmp_path, photos, views):
     """On a turntable the background stands still, whatever the poses."""
     still = np.random.default_rng(0).integers(0, 255, (80, 80, 3), dtype=np.uint8)
@@ -204,19 +195,6 @@ def test_masked_pixels_are_not_compared(tmp_path, photos, views):
     poses = [[records[i].world_to_camera for i in each.indices] for each in shared]
     assert len(shared) >= 4
     assert max(each.distance(each.lenses, *pose) for each, pose in zip(shared, poses, strict=True)) < 1
-
-
-def test_pixels_beyond_the_model_of_a_lens_do_not_count():
-    lens = Lens("RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3, 0.0), Path("cameras.txt"))
-    camera = pycolmap.Camera(model=lens.model, width=640, height=480, params=list(lens.params))
-    points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (100, 3))
-    first, second = np.eye(4), np.eye(4)
-    second[:3, 3] = -0.5, 0.1, 0.05
-    corner = np.full((1, 2), 3.0)
-    places = [np.concatenate([camera.img_from_cam(points + pose[:3, 3]), corner]) for pose in (first, second)]
-    assert np.isnan(camera.cam_from_img(corner)).all()
-    shared = SharedPixels((0, 1), (lens, lens), (places[0], places[1]))
-    assert shared.distance(shared.lenses, first, second) < 1e-6
 
 
 def test_the_check_is_made_once_and_again_if_a_pose_changes(tmp_path, photos, views, monkeypatch):

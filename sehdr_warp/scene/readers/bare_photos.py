@@ -170,7 +170,7 @@ def place_photos(dataset: DataparserOutputs, cache: Path | str | None) -> tuple[
     refuse_stack(photos, folder)
     try:
         masks = [record.mask for record in dataset.records]
-        place = reconstruct_panoramas if are_panoramas(photos) else partial(_reconstruct, masks=masks)
+        place = reconstruct_panoramas if are_panoramas(photos) else partial(reconstruct_with_masks, masks=masks)
         reconstruction = place(photos, cache)
     except InputError as error:
         inner = _folders_with_photos(folder) if photos[0].parent == folder else []
@@ -229,7 +229,9 @@ def with_cameras(dataset: DataparserOutputs, cameras: Sequence[PlacedPhoto]) -> 
     return replace(dataset, records=tuple(placed), notes=tuple(notes)), [names[i] for i in others]
 
 
-def _reconstruct(photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]) -> Reconstruction:
+def reconstruct_with_masks(
+    photos: Sequence[Path], cache: Path | str | None, masks: Sequence[Path | None]
+) -> Reconstruction:
     """Place photos by the features inside their masks, as COLMAP does, or by all.
 
     A still background would misplace an object that turns, and people who walk along would misplace a building. All

@@ -28,7 +28,7 @@ def likely_pairs(database: Path) -> list[tuple[str, str]]:
     scores = np.zeros((len(names), len(names)), int)
     for _, i in track_progress("comparing photos", range(len(names)), _log):
         for j in range(i + 1, len(names)):
-            scores[i, j] = scores[j, i] = _match_count(features[i], features[j])
+            scores[i, j] = scores[j, i] = match_count(features[i], features[j])
     best = np.argsort(-scores, axis=1, kind="stable")[:, :PARTNERS]
     pairs = {(min(i, j), max(i, j)) for i, row in enumerate(best.tolist()) for j in row if scores[i, j]}
     return [(names[i], names[j]) for i, j in sorted(pairs)]
@@ -71,7 +71,7 @@ def _coarse_features(database: Path) -> tuple[list[str], list[np.ndarray]]:
     return [image.name for image in images], features
 
 
-def _match_count(first: np.ndarray, second: np.ndarray) -> int:
+def match_count(first: np.ndarray, second: np.ndarray) -> int:
     """Return how many unit vectors [K, D] of two sets are each other's nearest, and nearer than the second nearest."""
     if min(len(first), len(second)) < 2:
         return 0

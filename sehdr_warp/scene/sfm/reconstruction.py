@@ -110,7 +110,7 @@ def reconstruct(
     key = cache_key("photos", digests, [mask and file_digest(mask) for mask in masks if any(masks)])
 
     def solve(work: Path, result: Path) -> None:
-        sizes, small = _write_photos(photos, work / "images")
+        sizes, small = write_photos(photos, work / "images")
         if any(masks):
             (work / "masks").mkdir()
             for i, mask in enumerate(masks):
@@ -120,7 +120,7 @@ def reconstruct(
         groups: dict[tuple, list[int]] = {}  # One set of intrinsics for a size, a device and a focal length.
         for i, photo in enumerate(photos):
             if all(small[i]):  # It has a copy.
-                groups.setdefault((sizes[i], small[i], _device(photo)), []).append(i)
+                groups.setdefault((sizes[i], small[i], exif_device(photo)), []).append(i)
         count = sum(len(group) for group in groups.values())
         with (
             stage("finding features in photos", count, _log) as progress,
@@ -129,7 +129,7 @@ def reconstruct(
             for (_, (width, height), device), group in groups.items():
                 params = (_focal_prior(device[-1], width, height), width / 2, height / 2, 0.0)
                 names = [image_name(i) for i in group]
-                _extract(database, work, names, params)
+                extract_features(database, work, names, params)
             photo_seconds = progress.seconds / count
             progress.update(count)
         _match(database, count, photo_seconds)
@@ -176,7 +176,7 @@ def image_name(index: int) -> str:
     return f"{index:05d}.png"
 
 
-def _write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+def write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Write oriented 8-bit copies of at most MAX_SIDE pixels.
 
     Photos that cannot be decoded have no copy, and a warning names them.
@@ -220,7 +220,7 @@ def _focal_prior(equivalent: str, width: int, height: int) -> float:
     return 1.2 * max(width, height)
 
 
-def _device(photo: Path) -> tuple[str, ...]:
+def exif_device(photo: Path) -> tuple[str, ...]:
     """Return EXIF's maker, model, focal length and its 35 mm equivalent as text, "None" if EXIF does not state them.
 
     RAW and float photos have "None" for all, because a set of them has one camera.
@@ -236,7 +236,7 @@ def _device(photo: Path) -> tuple[str, ...]:
             return ("None",) * 4
 
 
-def _extract(database: Path, work: Path, names: list[str], params) -> None:
+def extract_features(database: Path, work: Path, names: list[str], params) -> None:
     """Extract the features of images, in images/ and where masks/ keeps them, that share one camera."""
     import pycolmap
 

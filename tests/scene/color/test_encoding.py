@@ -13,13 +13,15 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color.encoding import encoding_of, encoding_of_profile
 from sehdr_warp.scene.color.icc import xyz_to_rec709
-from sehdr_warp.scene.color.primaries import REC709, linear_to_srgb, matrix_to_rec709, srgb_to_linear
+from sehdr_warp.scene.color.primaries import REC709, srgb_to_linear
 from sehdr_warp.scene.images.ldr_files import EncodedImage, open_image, read_ldr
 from tests.make_scenes import load, pattern, png_of, write_colmap
 
 SPACES = {"sRGB": ("sRGB", None), "Display P3": ("Display P3", None), "Adobe RGB": ("Adobe RGB (1998)", 563 / 256),
           "ProPhoto": ("ProPhoto RGB", 1.8), "Rec.2020": ("ITU-R BT.2020", 2.4), "ACEScg": ("ACEScg", 2.2),
           "ACES AP0": ("ACES2065-1", 2.2)}  # fmt: skip
+
+
 PATCHES = np.array([[230, 60, 40], [40, 200, 60], [30, 60, 220], [128, 128, 128], [250, 240, 10], [3, 7, 20]])
 
 
@@ -358,13 +360,3 @@ def test_narrow_range_and_unstated_code_points(tmp_path):
     light, _ = narrow.to_linear(np.array([[[16, 126, 235]]], np.uint8))
     np.testing.assert_allclose(light[0, 0], srgb_to_linear(np.array([0, 110 / 219, 1])), atol=2e-3)
     assert unstated.is_srgb and rec709.is_srgb
-
-
-def test_curves_and_primaries():
-    values = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(values)), values, atol=1e-6)
-    np.testing.assert_array_equal(matrix_to_rec709(REC709), np.eye(3))
-    np.testing.assert_allclose(matrix_to_rec709((0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)).sum(1), 1)
-    for bad in ((0.1, 0.1, 0.2, 0.2, 0.3, 0.3, 0.3127, 0.329), (0.0,) * 8, (float("nan"),) * 8):
-        with pytest.raises(ValueError, match="span no colors"):
-            matrix_to_rec709(bad)

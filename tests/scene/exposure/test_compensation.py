@@ -216,7 +216,7 @@ def test_photos_that_do_not_fit_into_memory_are_evened_into_a_file(gains, monkey
     with caplog.at_level("INFO"):
         on_disk = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
     assert "they are read from a nameless file" in caplog.text
-    files = {photo_storage._file_of(view.codes) for view in on_disk.views}
+    files = {photo_storage.file_of(view.codes) for view in on_disk.views}
     assert len(files) == 1 and None not in files
     assert all(np.array_equal(a.codes, b.codes) for a, b in zip(on_disk.views, in_memory.views, strict=True))
     # Photos that are left as they are stay in the file where they were.

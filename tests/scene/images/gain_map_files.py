@@ -10,8 +10,6 @@ from PIL import Image
 
 from sehdr_warp.scene.images.heif import item_bytes, read_items
 
-BASE_LIGHT = "srgb"
-
 
 def iso_metadata(
     maximum, minimum=0.0, gamma=1.0, offset=1 / 64, headroom=None, base_headroom=0.0, channels=1, base_colors=True
@@ -137,3 +135,52 @@ def write_heif_pair(
 
     start = len(head) + len(meta(0)) + 8
     path.write_bytes(head + meta(start) + _box("mdat", b"".join(payloads[number] for number, _ in items)))
+
+
+HEIGHT, WIDTH = 96, 128
+
+
+STOPS = 2.5
+
+
+def linear(codes):
+    values = codes / np.iinfo(codes.dtype).max
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def encoded(light):
+    light = np.clip(light, 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def scene():
+    """[H, W, 3] smooth light from 0.05 to 2^STOPS times white."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
+    level = 0.5 + 0.5 * np.sin(2.5 * x + 2 * y)
+    return (0.05 * (2**STOPS / 0.05) ** level)[..., None] * [1.0, 0.9, 0.8]
+
+
+def pair(apple=False, channels=1):
+    """The photo clipped at white, and what the map holds: [h, w(, 3)] uint8 at half of the size."""
+    light = scene()
+    base = np.rint(255 * encoded(light)).astype(np.uint8)
+    base_light = linear(base)
+    if apple:
+        share = (light.max(2) / base_light.max(2) - 1) / (2**STOPS - 1)
+        share = np.clip(share, 0, 1)
+        stored = np.where(share <= 0.0181, 4.5 * share, 1.099 * np.maximum(share, 1e-9) ** 0.45 - 0.099)
+    else:
+        gains = np.log2((light + 1 / 64) / (base_light + 1 / 64)) / STOPS
+        stored = gains if channels == 3 else gains[..., 0]
+    small = np.clip(stored, 0, 1)
+    small = small.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, -1).mean((1, 3)).squeeze()
+    return light, base, np.rint(255 * small).astype(np.uint8)
+
+
+def iso_segment(**options):
+    return 0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0" + iso_metadata(STOPS, **options)
+
+
+def hdrgm(**more):
+    fields = {"Version": "1.0", "GainMapMin": "0", "GainMapMax": str(STOPS), "HDRCapacityMin": "0"}
+    return xmp_segment(fields | {"HDRCapacityMax": str(STOPS)} | more)

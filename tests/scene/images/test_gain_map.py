@@ -3,7 +3,6 @@
 import json
 import logging
 import struct
-import time
 
 import colour
 import numpy as np
@@ -12,49 +11,26 @@ from PIL import Image
 
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color.primaries import matrix_to_rec709
-from sehdr_warp.scene.images.gain_map import GainMap, light_of, read_gain_map
-from sehdr_warp.scene.images.gain_map_parameters import GainMapParameters
+from sehdr_warp.scene.images.gain_map import light_of, read_gain_map
 from sehdr_warp.scene.images.ldr_files import read_ldr
 
 from ..color.test_encoding import icc_profile
-from .gain_map_files import iso_metadata, jpeg_bytes, write_heif_pair, write_jpeg_pair, xmp_segment
-
-HEIGHT, WIDTH = 96, 128
-STOPS = 2.5
-
-
-def linear(codes):
-    values = codes / np.iinfo(codes.dtype).max
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def encoded(light):
-    light = np.clip(light, 0, 1)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-
-
-def scene():
-    """[H, W, 3] smooth light from 0.05 to 2^STOPS times white."""
-    y, x = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
-    level = 0.5 + 0.5 * np.sin(2.5 * x + 2 * y)
-    return (0.05 * (2**STOPS / 0.05) ** level)[..., None] * [1.0, 0.9, 0.8]
-
-
-def pair(apple=False, channels=1):
-    """The photo clipped at white, and what the map holds: [h, w(, 3)] uint8 at half of the size."""
-    light = scene()
-    base = np.rint(255 * encoded(light)).astype(np.uint8)
-    base_light = linear(base)
-    if apple:
-        share = (light.max(2) / base_light.max(2) - 1) / (2**STOPS - 1)
-        share = np.clip(share, 0, 1)
-        stored = np.where(share <= 0.0181, 4.5 * share, 1.099 * np.maximum(share, 1e-9) ** 0.45 - 0.099)
-    else:
-        gains = np.log2((light + 1 / 64) / (base_light + 1 / 64)) / STOPS
-        stored = gains if channels == 3 else gains[..., 0]
-    small = np.clip(stored, 0, 1)
-    small = small.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, -1).mean((1, 3)).squeeze()
-    return light, base, np.rint(255 * small).astype(np.uint8)
+from .gain_map_files import (
+    HEIGHT,
+    STOPS,
+    WIDTH,
+    encoded,
+    hdrgm,
+    iso_metadata,
+    iso_segment,
+    jpeg_bytes,
+    linear,
+    pair,
+    scene,
+    write_heif_pair,
+    write_jpeg_pair,
+    xmp_segment,
+)
 
 
 def decoded(path):
@@ -69,15 +45,6 @@ def assert_light(result, expected, channels=1):
     assert result[..., 0].max() == pytest.approx(expected[..., 0].max(), rel=0.03)
 
 
-def iso_segment(**options):
-    return 0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0" + iso_metadata(STOPS, **options)
-
-
-def hdrgm(**more):
-    fields = {"Version": "1.0", "GainMapMin": "0", "GainMapMax": str(STOPS), "HDRCapacityMin": "0"}
-    return xmp_segment(fields | {"HDRCapacityMax": str(STOPS)} | more)
-
-
 OTHER_PREFIX = 0xFFE1, hdrgm()[1].replace(b"hdrgm:", b"gm:").replace(b"xmlns:hdrgm", b"xmlns:gm")
 
 
@@ -88,20 +55,6 @@ def test_gain_maps_in_jpeg(tmp_path, segment):
     assert read_gain_map(tmp_path / "a.jpg") is not None
     assert_light(decoded(tmp_path / "a.jpg"), light)
     assert read_gain_map(tmp_path / "a.jpg").headroom == pytest.approx(STOPS, abs=0.05)
-
-
-@pytest.mark.parametrize("factor", [2, 3])
-def test_a_small_gain_map_follows_the_edges_of_its_photo(factor):
-    """A window beside a wall: the gain of a pixel of the map that covers both is that of neither."""
-    light = np.full((60, 60, 3), 0.2, np.float32)
-    light[13:44, 16:47] = 40.0
-    gain = np.log2(np.maximum(light, 1)).mean(2) / 6
-    small = gain.reshape(60 // factor, factor, 60 // factor, factor).mean((1, 3)).astype(np.float32)
-    parameters = GainMapParameters(maximum=6.0, base_offset=0.0, alternate_offset=0.0)
-    gain_map = GainMap(small[..., None], parameters)
-    error = np.abs(np.log2(gain_map.light(np.minimum(light, 1)) / light))
-    plain = np.asarray(Image.fromarray(small).resize((60, 60), Image.Resampling.BILINEAR))
-    assert error.mean() < 0.5 * 6 * np.abs(plain - gain).mean() and error[20:37, 23:40].max() < 0.02
 
 
 def colorful_pair():
@@ -220,20 +173,6 @@ def test_a_second_picture_without_metadata_is_no_gain_map(tmp_path):
     assert read_gain_map(tmp_path / "a.jpg") is None
 
 
-@pytest.mark.parametrize("segment", [
-    (0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0" + iso_metadata(STOPS)[:20]),
-    (0xFFE2, b"urn:iso:std:iso:ts:21496:-1\0\0\7" + iso_metadata(STOPS)[2:]),
-    hdrgm(GainMapMax="nan"), hdrgm(GainMapMax="400"), hdrgm(Gamma="0"), hdrgm(GainMapMax="much"),
-], ids=["cut", "version", "nan", "bright", "gamma", "word"])  # fmt: skip
-def test_a_damaged_gain_map_is_named_and_the_photo_is_used(tmp_path, caplog, segment):
-    _, base, gain = pair()
-    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [segment])
-    with caplog.at_level(logging.WARNING, "sehdr_warp.scene"):
-        assert read_gain_map(tmp_path / "a.jpg") is None
-    assert "a.jpg: its gain map is damaged" in caplog.text
-    assert read_ldr(tmp_path / "a.jpg").pixels.shape == base.shape
-
-
 def test_damaged_gain_maps_of_a_set_are_named_in_one_note(tmp_path, caplog):
     _, base, gain = pair()
     write_set(tmp_path)
@@ -350,27 +289,6 @@ def test_maps_of_no_and_of_many_stops(tmp_path, stops):
     (tmp_path / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
     scene = load_scene(tmp_path)
     assert scene.views[0].exposure_time == pytest.approx(0.97 * 2 ** -min(stops, 4))
-
-
-@pytest.mark.parametrize(
-    "text", ["<hdrgm:a>", "<hdrgm:Gamma>", "<hdrgm:Gamma ", "hdrgm:Gamma=", "<rdf:li", "<hdrgm:" + "a" * 50]
-)
-def test_long_metadata_take_no_long_time(tmp_path, text):
-    _, base, gain = pair()
-    marker, body = hdrgm()
-    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [(marker, body + (text * (64000 // len(text))).encode()[:64000])])
-    started = time.process_time()
-    assert read_gain_map(tmp_path / "a.jpg") is not None
-    assert time.process_time() - started < 1
-
-
-def test_values_as_elements_and_sequences(tmp_path):
-    _, base, gain = pair()
-    listed = "".join(f"<rdf:li>{value}</rdf:li>" for value in (1.0, 2.0, 3.0))
-    inner = f"<hdrgm:GainMapMax><rdf:Seq>{listed}</rdf:Seq></hdrgm:GainMapMax><hdrgm:Gamma>2</hdrgm:Gamma>"
-    write_jpeg_pair(tmp_path / "a.jpg", base, gain, [(0xFFE1, b"http://ns.adobe.com/xap/1.0/\0" + inner.encode())])
-    result = read_gain_map(tmp_path / "a.jpg").parameters
-    assert result.maximum.tolist() == [1, 2, 3] and result.gamma.tolist() == [2, 2, 2]
 
 
 @pytest.mark.parametrize("behind", [b"", b"a film" * 50], ids=["alone", "motion photo"])

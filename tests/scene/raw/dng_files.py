@@ -1,14 +1,23 @@
 """DNG files with any tags, made in memory (Adobe's DNG specification 1.7)."""
 
 import io
+import json
 import struct
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene.raw.decode import read_raw
+from tests.output.helpers import camera
+
 TO_CAMERA = np.array([[0.9, -0.2, -0.1], [-0.4, 1.2, 0.2], [-0.1, 0.2, 0.6]])  # XYZ to the sensor's colors
+
+
 BAYER = np.array([[0, 1], [1, 2]])
+
+
 Tag = tuple[int, int, bytes]
 
 
@@ -120,3 +129,52 @@ def jpeg_tiles(codes, size):
             tile.save(buffer, "JPEG", quality=100, subsampling=0)
             tiles.append(buffer.getvalue())
     return tiles
+
+
+TRUTH = np.array([0.1, 0.3, 0.2])
+
+
+HEIGHT, WIDTH = 96, 128
+
+
+EVEN = np.broadcast_to(TRUTH, (HEIGHT, WIDTH, 3))
+
+
+Y, X = np.mgrid[:HEIGHT, :WIDTH]
+
+
+def light_of(path, oriented=False):
+    return response_by_name("srgb").decode(read_raw(path, oriented=oriented).pixels / 65535)
+
+
+def stored(light, black=512.0, white=15000.0):
+    return np.rint(black + light * (white - black)).astype(np.uint16)
+
+
+LEVELS = {50714: longs(512), 50717: longs(15000)}
+
+
+def shading():
+    """Light that falls to a quarter towards the corners, and the gains that undo it."""
+    v, h = np.mgrid[:13, :17]
+    gains = 1 + 3 * ((v / 12 - 0.5) ** 2 + (h / 16 - 0.5) ** 2) / 0.5
+    return 1 / (1 + 3 * (((Y + 0.5) / HEIGHT - 0.5) ** 2 + ((X + 0.5) / WIDTH - 0.5) ** 2) / 0.5), gains
+
+
+def picture(seed=0, height=24, width=32):
+    """[H, W, 3] smooth light over three decades, as a neutral-free gradient."""
+    random = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width] / width
+    return np.exp(4 * np.sin(3 * x + random.uniform(0, 3)) + 2 * y)[..., None] * random.uniform(0.3, 1, 3)
+
+
+def posed(folder, write, suffix, count=6):
+    """A transforms.json of photos that write(path, index) makes."""
+    frames = []
+    for i in range(count):
+        write(folder / f"{i}{suffix}", i)
+        pose = np.linalg.inv(camera(position=(0.3 * i, 0, -3)).world_to_camera) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{i}{suffix}", "transform_matrix": pose.tolist()})
+    values = {"w": 32, "h": 24, "fl_x": 40, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(values))
+    return folder

@@ -1,4 +1,3 @@
-import json
 import shutil
 
 import numpy as np
@@ -9,108 +8,23 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.model.color_models import rec709_of
-from sehdr_warp.output.images.exr import rgb_channels, write_exr, write_radiance
-from sehdr_warp.output.images.ldr_files import write_picture
+from sehdr_warp.output.images.exr import rgb_channels, write_exr
 from sehdr_warp.response import response_by_name
-from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run import Splats
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.photos import usable_photos
 from sehdr_warp.scene.raw.decode import color_matrix, linear_codes, read_header, read_raw
 from sehdr_warp.scene.raw.dng import read_dng
 from sehdr_warp.scene.readers.bare_photos import find_photos
-from sehdr_warp.scene.sfm.reconstruction import _device, _write_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
-from sehdr_warp.training.plan import make_plan
+from tests.scene.raw.dng_files import picture, posed
 from tests.splats.samples import gaussians
 
-from ...make_scenes import edited_json, write_colmap
+from ...make_scenes import edited_json
 from ...output.helpers import camera
 from .dng_files import TO_CAMERA, write_dng
 
 BALANCE = np.array([0.5, 1.0, 0.7])
-
-
-def picture(seed=0, height=24, width=32):
-    """[H, W, 3] smooth light over three decades, as a neutral-free gradient."""
-    random = np.random.default_rng(seed)
-    y, x = np.mgrid[:height, :width] / width
-    return np.exp(4 * np.sin(3 * x + random.uniform(0, 3)) + 2 * y)[..., None] * random.uniform(0.3, 1, 3)
-
-
-def posed(folder, write, suffix, count=6):
-    """A transforms.json of photos that write(path, index) makes."""
-    frames = []
-    for i in range(count):
-        write(folder / f"{i}{suffix}", i)
-        pose = np.linalg.inv(camera(position=(0.3 * i, 0, -3)).world_to_camera) @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"{i}{suffix}", "transform_matrix": pose.tolist()})
-    values = {"w": 32, "h": 24, "fl_x": 40, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(values))
-    return folder
-
-
-def light_of(view, scene):
-    return scene.response.decode(view.codes / 65535) / view.exposure_time
-
-
-@pytest.mark.parametrize("suffix, tolerance", [(".exr", 2e-3), (".hdr", 0.02)])
-def test_float_pictures_are_photos_whose_light_is_known(tmp_path, suffix, tolerance):
-    def write(path, i):
-        if suffix == ".exr":
-            write_exr(path, rgb_channels(picture(i)), pixel="float")
-        else:
-            write_radiance(path, picture(i))
-
-    scene = load_scene(posed(tmp_path, write, suffix))
-    assert scene.response.name == "hdr-nerf" and scene.color_matrix is None and len(scene.test_views) == 1
-    for i, view in enumerate(scene.views):
-        np.testing.assert_allclose(light_of(view, scene), picture(i), rtol=tolerance, atol=1e-3)
-        assert view.codes.max() < 65535
-        np.testing.assert_allclose(view.hdr, picture(i), rtol=tolerance)
-    with pytest.raises(InputError, match="its photos are float: their light is known, and response srgb"):
-        load_scene(tmp_path, response="srgb")
-    config = make_plan(scene, load_config("default", {}), "cpu").config
-    assert (config.loss.hdr_weight, config.loss.ldr_weight, config.loss.form) == (1, 0, "blend")
-
-
-def _write_cut_out(path, light, alpha):
-    import OpenEXR
-
-    pixels = np.dstack([light * alpha[..., None], alpha]).astype(np.float32)
-    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-    OpenEXR.File(header, {"RGBA": pixels}).write(str(path))
-
-
-def test_transparency_of_openexr_counts_as_that_of_other_photos(tmp_path):
-    """Alpha is a mask in photographed sets, and black light in rendered ones, whose colors it has dimmed already."""
-    alpha = np.ones((24, 32), np.float32)
-    alpha[:6], alpha[6:12] = 0, 0.5
-    scene = load_scene(posed(tmp_path, lambda path, i: _write_cut_out(path, picture(i), alpha), ".exr"))
-    assert "transparency" not in str(scene.notes) and scene.views[0].mask is None
-    np.testing.assert_allclose(light_of(scene.views[0], scene), picture() * alpha[..., None], rtol=2e-3, atol=1e-3)
-    pytest.importorskip("pycolmap")
-    write_colmap(tmp_path / "set", size=(32, 24), params=(40.0, 40.0, 16.0, 12.0))
-    for i in range(6):
-        (tmp_path / "set" / "images" / f"{i:03d}.png").unlink()
-        _write_cut_out(tmp_path / "set" / "images" / f"{i:03d}.exr", picture(i), alpha)
-    scene = load_scene(tmp_path / "set")
-    np.testing.assert_array_equal(scene.views[0].mask, alpha)
-    np.testing.assert_allclose(light_of(scene.views[0], scene)[6:], picture()[6:], rtol=2e-3, atol=1e-3)
-    assert "transparency: 6 of 6 photos have transparent pixels, which are left out" in scene.notes
-
-
-def test_linear_16_bit_photos(tmp_path):
-    def write(path, i):
-        write_picture(path, np.rint(np.clip(picture(i) / 20, 0, 1) * 65535).astype(np.uint16))
-
-    scene = load_scene(posed(tmp_path, write, ".png"), response="linear")
-    assert scene.response.name == "srgb"
-    for i, view in enumerate(scene.views):
-        expected = np.clip(picture(i) / 20, 0, 1)
-        expected = np.where(expected >= 0.99, 1, expected)
-        np.testing.assert_allclose(light_of(view, scene), expected, atol=2e-5, rtol=1e-4)
-        np.testing.assert_array_equal(view.codes == 65535, expected == 1)
 
 
 def test_what_clips_in_a_noisy_sensor_is_clipped():
@@ -265,19 +179,6 @@ def test_a_scene_in_a_sensors_colors_is_rendered_in_rec709(tmp_path):
     scene.field.response = response_by_name("colour:S-Log3")  # White is far above an exposure of 1
     light = np.array([8.0, 2, 6])
     np.testing.assert_allclose(scene.in_rec709(torch.tensor(light)), scene.color_matrix @ light, rtol=1e-6)
-
-
-def test_structure_from_motion_asks_linear_photos_for_no_exif(tmp_path):
-    write_exr(tmp_path / "a.exr", rgb_channels(picture()))
-    sizes, small = _write_photos([tmp_path / "a.exr"], tmp_path / "copies")
-    assert _device(tmp_path / "a.exr") == ("None",) * 4
-    exif = Image.Exif()
-    for name, exif[0x0110] in (("filled", "FC3682\0\0"), ("plain", "FC3682")):
-        Image.new("RGB", (4, 4)).save(tmp_path / f"{name}.jpg", exif=exif)
-        assert _device(tmp_path / f"{name}.jpg") == ("None", "FC3682", "None", "None")
-    assert (sizes, small) == ([(32, 24)], [(32, 24)])
-    copy = np.asarray(Image.open(tmp_path / "copies" / "00000.png"))
-    assert copy.dtype == np.uint8 and 60 < copy.mean() < 180
 
 
 def test_a_set_of_raw_files_becomes_a_scene(tmp_path):

@@ -1,8 +1,6 @@
 """Folders as phones, cameras and other programs leave them: what is read, and what is named instead."""
 
-import json
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +14,10 @@ from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
 from sehdr_warp.scene.photo_names import photo_labels
 from sehdr_warp.scene.readers import bare_photos
-from sehdr_warp.scene.readers.bare_photos import find_photos, with_cameras
+from sehdr_warp.scene.readers.bare_photos import find_photos, inner_folder, with_cameras
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
-from sehdr_warp.scene.sfm.reconstruction import Reconstruction
-from sehdr_warp.scene.unused_files import unused_notes
-from tests.make_scenes import arc_poses, edited_json, load, pattern, write_blender, write_colmap, write_ply
+from sehdr_warp.scene.sfm.reconstruction import Reconstruction, image_name
+from tests.make_scenes import arc_poses, load, pattern, write_blender, write_colmap
 
 
 def photos(folder, count=4, suffix=".jpg"):
@@ -141,27 +138,6 @@ def test_fewer_pictures_of_results_lie_beside_the_photos(tmp_path):
     assert any(note.startswith(f"5 photos of images {others} input: ") for note in find_photos(tmp_path).notes)
 
 
-def test_depth_and_confidence_beside_photos_are_not_photos(tmp_path):
-    """The 3D Scanner App writes all data so; a photo may have such a word in its name."""
-    photos(tmp_path)
-    Image.fromarray(pattern(16, 12, 9)).save(tmp_path / "depth_of_field.jpg")
-    for i in range(9):
-        Image.fromarray(pattern(8, 6, i)[..., 0].astype(np.uint16) << 4).save(tmp_path / f"depth_{i}.png")
-        Image.fromarray(pattern(8, 6, i)[..., 0]).save(tmp_path / f"frame-{i}.confidence.png")
-    dataset = find_photos(tmp_path)
-    assert [record.view for record in dataset.records] == [*(f"IMG_{i}" for i in range(4)), "depth_of_field"]
-    note = "18 pictures called depth, confidence or normals are left out: depth_0.png, depth_1.png,"
-    assert any(each.startswith(note) for each in dataset.notes)
-    assert unused_notes(tmp_path, dataset.records, dataset.mentioned) == []
-
-
-def test_grey_photos_of_a_conference_room_are_photos(tmp_path):
-    for i in range(4):
-        Image.fromarray(pattern(16, 12, i)[..., 0]).save(tmp_path / f"conf_room_{i}.png")
-    dataset = find_photos(tmp_path)
-    assert len(dataset.records) == 4 and dataset.notes == ()
-
-
 @pytest.mark.parametrize("file, tool", [
     ("cameras.xml", "Metashape"), ("bundle.out", "Bundler"), ("mesh_info.json", "Polycam"),
     ("Registration.csv", "RealityCapture"), ("frame_00000.json", "3D Scanner App"),
@@ -236,125 +212,6 @@ def test_folders_that_systems_keep_are_no_photos(tmp_path, place):
     assert len(scene.views) == 6 and not any("in no view" in note or "not used" in note for note in scene.notes)
 
 
-@pytest.mark.parametrize("change", ["null model", "text numbers", "flat pose", "mark", "matrix", "all in one folder"])
-def test_transforms_as_apps_write_them(tmp_path, change):
-    write_blender(tmp_path, 6)
-    file = tmp_path / "transforms.json"
-    before, values = load(tmp_path, holdout=0), json.loads(file.read_text())
-    if change == "null model":
-        values["camera_model"] = None
-    elif change == "text numbers":
-        values |= {"w": "40", "h": "30", "camera_angle_x": str(values["camera_angle_x"])}
-    elif change == "flat pose":
-        values["frames"] = [
-            frame | {"transform_matrix": np.ravel(frame["transform_matrix"]).tolist()} for frame in values["frames"]
-        ]
-    elif change == "matrix":
-        focal = 20 / np.tan(values.pop("camera_angle_x") / 2)  # Of photos of 40 x 30 pixels
-        matrix = [[focal, 0, 20], [0, focal, 15], [0, 0, 1]]
-        values["frames"] = [frame | {"K": matrix} for frame in values["frames"]]
-    elif change == "all in one folder":
-        for photo in (tmp_path / "images").iterdir():
-            photo.rename(tmp_path / photo.name)
-        (tmp_path / "images").rmdir()
-    file.write_bytes(b"\xef\xbb\xbf" * (change == "mark") + json.dumps(values).encode())
-    scene = load(tmp_path, holdout=0)
-    for view, other in zip(scene.views, before.views, strict=True):
-        np.testing.assert_array_equal(view.camera.world_to_camera, other.camera.world_to_camera)
-        assert view.camera.intrinsics == pytest.approx(other.camera.intrinsics)
-        assert (view.camera.fx, view.camera.width) == (other.camera.fx, other.camera.width)
-
-
-@pytest.mark.parametrize("value", ["", "wide", "nan", "inf"])
-def test_text_that_is_no_number_is_named(tmp_path, value):
-    write_blender(tmp_path, 6, fl_x=value)
-    with pytest.raises(InputError, match=f"fl_x = '?{value}'? is not a finite number"):
-        load(tmp_path)
-
-
-def test_masks_and_points_that_are_missing_are_named(tmp_path):
-    write_blender(tmp_path, 6, ply_file_path="sparse_pc.ply")
-    file = tmp_path / "transforms.json"
-    with edited_json(file) as values:
-        values["frames"][1]["mask_path"] = "masks/r_1.png"
-    scene = load(tmp_path, holdout=0)
-    assert len(scene.views) == 6
-    assert "1 mask that a frame states is not here, and its photo counts whole: r_1.png" in scene.notes
-    assert "the points that transforms.json states are not here: 'sparse_pc.ply'" in scene.notes
-
-
-@pytest.mark.parametrize("before", ["./m/", "m\\", "/home/other/room/m/", "C:\\room\\m\\"])
-def test_masks_and_points_under_other_spellings(tmp_path, before):
-    """instant-DexNerf issue 3 and exports of Windows: photos were found by such names, masks and points were not."""
-    write_blender(tmp_path, 6, ply_file_path=f"{before}cloud.ply")
-    (tmp_path / "m").mkdir()
-    write_ply(tmp_path / "m" / "cloud.ply", [(0, 0, 0), (1, 2, 3)])
-    file = tmp_path / "transforms.json"
-    with edited_json(file) as values:
-        for i, frame in enumerate(values["frames"]):
-            frame["mask_path"] = f"{before}half_{i}.png" if i else ""
-            Image.fromarray(np.eye(30, 40, dtype=np.uint8) * 255).save(tmp_path / "m" / f"half_{i}.png")
-    scene = load(tmp_path, holdout=0)
-    assert [view.mask is None for view in scene.views] == [True] + [False] * 5
-    assert "not here" not in str(scene.notes) and len(scene.points) == 2
-
-
-def test_splits_under_other_spellings(tmp_path):
-    """nerfstudio compares its lists of names as paths: `./images/r_0` is `images/r_0`."""
-    names = [f"images/r_{i}" for i in range(6)]
-    write_blender(tmp_path, 6, train_filenames=names[:4], test_filenames=["./" + names[4], names[5].replace("/", "\\")])
-    assert [view.name for view in load(tmp_path).test_views] == ["r_4", "r_5"]
-
-
-def test_a_lens_that_is_not_supported_is_named_before_its_focal_length(tmp_path):
-    write_blender(tmp_path, 6, camera_model="VR180_L", camera_angle_x=None)
-    with pytest.raises(InputError, match="camera_model 'VR180_L' is not supported"):
-        load(tmp_path)
-
-
-def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):
-    """The kind that may hold more counts, also if a copy is turned; a photo of the same name is no copy."""
-    for i in range(5):
-        photo = Image.fromarray(pattern(96, 64, i))
-        photo.save(tmp_path / f"IMG_{i}.png")
-        turned = Image.Exif()
-        turned[0x0112] = 6
-        if i < 3:
-            Image.fromarray(np.rot90(np.asarray(photo))).resize((32, 48)).save(
-                tmp_path / f"img_{i}.JPG", quality=70, exif=turned
-            )
-    Image.fromarray(pattern(96, 64, 9)).save(tmp_path / "IMG_4.jpg")
-    (tmp_path / "IMG_3.jpg").write_bytes(b"damaged")
-    dataset = find_photos(tmp_path)
-    names = [record.image.name for record in dataset.records]
-    assert sorted(names) == ["IMG_0.png", "IMG_1.png", "IMG_2.png", "IMG_3.jpg", "IMG_3.png", "IMG_4.jpg", "IMG_4.png"]
-    assert not any("no view" in note for note in unused_notes(tmp_path, dataset.records, dataset.mentioned))
-    (note,) = dataset.notes
-    assert note.startswith("3 photos are copies of others and left out: img_0.JPG of IMG_0.png")
-
-
-def test_copies_of_the_same_bytes_are_left_out_and_named(tmp_path):
-    for i in range(4):
-        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
-    shutil.copy(tmp_path / "IMG_2.jpg", tmp_path / "IMG_2 (1).jpg")
-    dataset = find_photos(tmp_path)
-    assert [record.image.name for record in dataset.records] == [f"IMG_{i}.jpg" for i in range(4)]
-    assert dataset.notes == ("1 photo is a copy of others and left out: IMG_2 (1).jpg of IMG_2.jpg",)
-
-
-@pytest.mark.parametrize("edited", ["IMG_E{}.jpg", "img_e{}.HEIC", "IMG_{}-edited.jpg"])
-def test_edited_photos_beside_their_originals_are_left_out_and_named(tmp_path, edited):
-    """Check edited photos as phones name them: of another tone they are copies, of another picture they are photos."""
-    for i in range(4):
-        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
-        brighter = np.minimum(pattern(96, 64, i if i < 3 else 9) * 1.2, 255).astype(np.uint8)
-        Image.fromarray(brighter).save(tmp_path / edited.format(i), "PNG")
-    dataset = find_photos(tmp_path)
-    names = {record.image.name for record in dataset.records}
-    assert names == {*(f"IMG_{i}.jpg" for i in range(4)), edited.format(3)}
-    assert dataset.notes == (f"3 photos are copies of others and left out: {edited.format(0)} of IMG_0.jpg ...",)
-
-
 @pytest.mark.parametrize("suffix", [".jfif", ".jpe", ".mpo"])
 def test_jpegs_under_their_other_suffixes(tmp_path, suffix):
     for i in range(3):
@@ -388,3 +245,68 @@ def test_cameras_of_a_run_are_found_by_names_in_other_case_or_form_of_an_accent(
     dataset, others = with_cameras(DataparserOutputs("photos", records), cameras)
     assert not others and [record.world_to_camera[0, 0] for record in dataset.records] == [0, 2, 1, 3]
     assert not dataset.notes
+
+
+def test_folders_far_below_count_if_none_is_near(tmp_path):
+    for place in (tmp_path / "kitti/2011_09_26/drive_0001/image_02/data", tmp_path / "kitti/photos"):
+        place.mkdir(parents=True)
+        for i in range(4):
+            Image.fromarray(pattern(16, 12, i)).save(place / f"{i}.jpg")
+        assert inner_folder(tmp_path) == place
+
+
+def test_a_folder_of_a_set_beside_the_photos_is_named(tmp_path):
+    write_blender(tmp_path / "nerfstudio_data", 4)
+    for place in (tmp_path / "images", tmp_path / "images_2"):
+        place.mkdir()
+        for i in range(4):
+            Image.fromarray(pattern(16, 12, i)).save(place / f"{i}.jpg")
+    assert find_photos(tmp_path).notes == ("photos in folders of it are not read: nerfstudio_data",)
+
+
+def test_photos_are_found_beside_a_cover_and_told_of_in_folders(tmp_path):
+    for name in ("day/1.png", "day/2.png", "day/3.png", "text/note.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match="day/1.png"):  # It is empty, and found all the same.
+        load(tmp_path)
+    (tmp_path / "day").rename(tmp_path / "images")
+    (tmp_path / "cover.jpg").touch()
+    with pytest.raises(InputError, match="images/1.png"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "photos, weak, turn, expected", [(6, (), 0, 6), (4, (1,), 0, 6), (4, (), 0, 4), (6, (), 0.2, 4)]
+)
+def test_whole_photos_are_used_if_they_place_more_and_agree_with_masks(
+    photos, weak, turn, expected, monkeypatch, caplog
+):
+    """Masks place four photos, whole photos six, whose cameras turn otherwise if an object turns before them."""
+    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
+
+    def reconstruction(poses, weak=()):
+        images = tuple(ModelImage(image_name(i), lens, pose) for i, pose in enumerate(poses))
+        cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+        return Reconstruction(SparseModel(images, cloud), 0.5, weak)
+
+    def turned(angle):
+        sine, cosine = np.sin(angle), np.cos(angle)
+        return np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+
+    inside = reconstruction(arc_poses(6)[:4], weak)
+    whole = reconstruction([turned(i * turn) @ pose @ turned(0.7) for i, pose in enumerate(arc_poses(6))])
+    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): inside if masks else whole)
+    files = [Path(f"{i}.jpg") for i in range(photos)]
+    assert len(bare_photos.reconstruct_with_masks(files, None, files).model.images) == expected
+    assert ("and cameras agree" in caplog.text) == (expected == 6)
+
+
+def test_masks_count_if_whole_photos_place_no_more_than_they(monkeypatch, caplog):
+    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
+    images = tuple(ModelImage(image_name(i), lens, np.eye(4)) for i in range(4))
+    cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    found = {masked: Reconstruction(SparseModel(images, cloud), 0.5, ()) for masked in (True, False)}
+    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): found[bool(masks)])
+    files = [Path(f"{i}.jpg") for i in range(12)]
+    assert bare_photos.reconstruct_with_masks(files, None, files) is found[True] and not caplog.text

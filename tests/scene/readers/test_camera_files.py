@@ -5,8 +5,14 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_cameras, look_at
+from tests.make_scenes import (
+    load,
+    write_blender,
+)
 
 POSE = look_at((1.0, 2.0, 3.0), (0.0, 0.5, 0.0))
+
+
 CAMERA = {"width": 8, "height": 8, "fx": 9, "fy": 9, "cx": 4, "cy": 4, "world_to_camera": POSE.tolist()}
 
 
@@ -103,3 +109,22 @@ def test_bad_camera_files_are_refused(tmp_path, content, message):
     (tmp_path / "c.json").write_text(content)
     with pytest.raises(InputError, match=message):
         load_cameras(tmp_path / "c.json")
+
+
+def test_cameras_from_every_kind_of_file(tmp_path):
+    write_blender(tmp_path, w=40, h=30)
+    scene = load(tmp_path, cache=tmp_path / "cache")
+    expected = scene.views[2].camera
+    own = tmp_path / "cameras.json"
+    own.write_text(json.dumps({"cameras": [{"name": "a", **expected.to_dict()}, {"name": "b", **expected.to_dict()}]}))
+    matrix = expected.camera_to_world.copy()
+    matrix[:3, 1:3] *= -1
+    path = tmp_path / "camera_path.json"
+    fov = float(np.degrees(2 * np.arctan(15 / expected.fy)))
+    entry = {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": 1}
+    path.write_text(json.dumps({"render_width": 40, "render_height": 30, "camera_path": [entry]}))
+    for file, index, name in ((own, 1, "b"), (path, 0, "0000"), (tmp_path / "transforms.json", 2, "r_2")):
+        read_name, camera = load_cameras(file)[index]
+        assert read_name == name
+        np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-12)
+        np.testing.assert_allclose(camera.intrinsics, expected.intrinsics, rtol=1e-12)

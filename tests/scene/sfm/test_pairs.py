@@ -7,7 +7,7 @@ import pytest
 
 from sehdr_warp.scene.sfm import pairs as sfm_pairs
 from sehdr_warp.scene.sfm import reconstruction
-from sehdr_warp.scene.sfm.pairs import _match_count, likely_pairs, pairs_with
+from sehdr_warp.scene.sfm.pairs import likely_pairs, match_count, pairs_with
 
 
 def descriptors(count, seed, like=None, noise=0.0):
@@ -20,11 +20,11 @@ def descriptors(count, seed, like=None, noise=0.0):
 
 def test_features_of_one_thing_match_and_others_do_not():
     first = descriptors(60, 0)
-    assert _match_count(first, descriptors(60, 1, first, 0.1)) == 60
-    assert _match_count(first, descriptors(60, 2)) == 0
+    assert match_count(first, descriptors(60, 1, first, 0.1)) == 60
+    assert match_count(first, descriptors(60, 2)) == 0
     half = np.concatenate([descriptors(30, 3, first[:30], 0.1), descriptors(30, 4)])
-    assert _match_count(first, half) == 30
-    assert _match_count(first, first[:1]) == _match_count(first[:0], first) == 0
+    assert match_count(first, half) == 30
+    assert match_count(first, first[:1]) == match_count(first[:0], first) == 0
 
 
 @pytest.fixture

@@ -12,20 +12,30 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.output.images.exr import rgb_channels, write_exr
 from sehdr_warp.scene.color.primaries import linear_to_srgb, srgb_to_linear
 from sehdr_warp.scene.dataparser import PointCloud
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.load import parse_dataset
 from sehdr_warp.scene.photos import brightened_codes
-from sehdr_warp.scene.readers import bare_photos
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.sfm import pairs
 from sehdr_warp.scene.sfm import reconstruction as sfm
-from sehdr_warp.scene.sfm.reconstruction import MOST_ERROR, Reconstruction, image_name, reconstruct
-from tests.make_scenes import arc_poses, load
+from sehdr_warp.scene.sfm.reconstruction import (
+    MOST_ERROR,
+    Reconstruction,
+    exif_device,
+    image_name,
+    reconstruct,
+    write_photos,
+)
+from tests.make_scenes import load
+from tests.scene.raw.dng_files import picture
 
 # Of messages and of estimates of time
 WITHOUT_EFFECT = {"MOST_ERROR", "_SURE", "_MOST_TURNED", "_NEAR", "_PAIR_COST", "_PLACE_COST"}
+
+
 CONSTANTS = {
     name
     for module in (pairs, sfm)
@@ -100,7 +110,7 @@ def test_images_are_numbered_by_name_however_long_their_features_take(tmp_path):
         blocks = random.integers(0, 255, (60, 80), np.uint8)
         pixels = np.kron(blocks, np.ones((6, 6), np.uint8)) if index == 0 else np.full((360, 480), 99, np.uint8)
         Image.fromarray(pixels).save(tmp_path / "images" / name)
-    sfm._extract(tmp_path / "database.db", tmp_path, names, (600.0, 240.0, 180.0, 0.0))
+    sfm.extract_features(tmp_path / "database.db", tmp_path, names, (600.0, 240.0, 180.0, 0.0))
     with pycolmap.Database.open(tmp_path / "database.db") as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
         assert [image.name for image in images] == names
@@ -143,9 +153,9 @@ def test_turned_photos_are_placed_upright(tmp_path, shared):
             upright = image.reduce(6)
         exif = Image.Exif()
         exif[0x0112] = 6
-        for folder, picture, tags in (("up", upright, Image.Exif()), ("side", upright.rotate(90, expand=True), exif)):
+        for folder, shot, tags in (("up", upright, Image.Exif()), ("side", upright.rotate(90, expand=True), exif)):
             (tmp_path / folder).mkdir(exist_ok=True)
-            picture.save(tmp_path / folder / f"{photo.stem}.png", exif=tags)
+            shot.save(tmp_path / folder / f"{photo.stem}.png", exif=tags)
     up, side = (load(tmp_path / folder, max_size=100) for folder in ("up", "side"))
     assert len(up.views) == len(side.views) == 4
     for a, b in zip(up.views, side.views, strict=True):
@@ -210,42 +220,6 @@ def test_masks_that_keep_too_little_are_not_used_for_placing(tmp_path, shared, c
         mask.save(tmp_path / "masks" / f"{photo.stem}.png")
     assert len(load(tmp_path, max_size=100).views) == 4
     assert "masks leave too little to place half of the photos" in caplog.text
-
-
-@pytest.mark.parametrize(
-    "photos, weak, turn, expected", [(6, (), 0, 6), (4, (1,), 0, 6), (4, (), 0, 4), (6, (), 0.2, 4)]
-)
-def test_whole_photos_are_used_if_they_place_more_and_agree_with_masks(
-    photos, weak, turn, expected, monkeypatch, caplog
-):
-    """Masks place four photos, whole photos six, whose cameras turn otherwise if an object turns before them."""
-    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
-
-    def reconstruction(poses, weak=()):
-        images = tuple(ModelImage(image_name(i), lens, pose) for i, pose in enumerate(poses))
-        cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
-        return Reconstruction(SparseModel(images, cloud), 0.5, weak)
-
-    def turned(angle):
-        sine, cosine = np.sin(angle), np.cos(angle)
-        return np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
-
-    inside = reconstruction(arc_poses(6)[:4], weak)
-    whole = reconstruction([turned(i * turn) @ pose @ turned(0.7) for i, pose in enumerate(arc_poses(6))])
-    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): inside if masks else whole)
-    files = [Path(f"{i}.jpg") for i in range(photos)]
-    assert len(bare_photos._reconstruct(files, None, files).model.images) == expected
-    assert ("and cameras agree" in caplog.text) == (expected == 6)
-
-
-def test_masks_count_if_whole_photos_place_no_more_than_they(monkeypatch, caplog):
-    lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
-    images = tuple(ModelImage(image_name(i), lens, np.eye(4)) for i in range(4))
-    cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
-    found = {masked: Reconstruction(SparseModel(images, cloud), 0.5, ()) for masked in (True, False)}
-    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): found[bool(masks)])
-    files = [Path(f"{i}.jpg") for i in range(12)]
-    assert bare_photos._reconstruct(files, None, files) is found[True] and not caplog.text
 
 
 def test_many_photos_are_placed_by_their_likely_pairs(tmp_path, shared, monkeypatch, caplog):
@@ -327,3 +301,16 @@ def test_photos_from_one_place_are_told(tmp_path, step):
     except InputError as error:
         message = str(error)
     assert ("as if the camera only turned" if step else "as if taken from one place") in message
+
+
+def test_structure_from_motion_asks_linear_photos_for_no_exif(tmp_path):
+    write_exr(tmp_path / "a.exr", rgb_channels(picture()))
+    sizes, small = write_photos([tmp_path / "a.exr"], tmp_path / "copies")
+    assert exif_device(tmp_path / "a.exr") == ("None",) * 4
+    exif = Image.Exif()
+    for name, exif[0x0110] in (("filled", "FC3682\0\0"), ("plain", "FC3682")):
+        Image.new("RGB", (4, 4)).save(tmp_path / f"{name}.jpg", exif=exif)
+        assert exif_device(tmp_path / f"{name}.jpg") == ("None", "FC3682", "None", "None")
+    assert (sizes, small) == ([(32, 24)], [(32, 24)])
+    copy = np.asarray(Image.open(tmp_path / "copies" / "00000.png"))
+    assert copy.dtype == np.uint8 and 60 < copy.mean() < 180

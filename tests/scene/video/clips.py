@@ -60,3 +60,10 @@ def write_clip(path: Path, frames, *, tags=(1, 1, 1), codec="libx265", pixels="y
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)
+
+
+def still(value=None, height=48, width=64):
+    """One frame: a ramp of grey beside patches of color, or one value."""
+    frame = np.repeat(np.linspace(0.02, 0.98, width)[None, :, None], height, 0).repeat(3, 2)
+    frame[height // 2 :, :16], frame[height // 2 :, 16:32] = (0.7, 0.2, 0.1), (0.1, 0.3, 0.8)
+    return [frame if value is None else np.full((height, width, 3), value)] * 3

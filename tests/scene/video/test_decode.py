@@ -13,68 +13,14 @@ from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import Config
 from sehdr_warp.scene import Camera, load_scene, look_at
 from sehdr_warp.scene.images.ldr_files import read_ldr
-from sehdr_warp.scene.video.color import VideoColor
 from sehdr_warp.scene.video.decode import codes, decode, is_video, open_clip
 from sehdr_warp.scene.video.frames import choose_frames, read_video
 from sehdr_warp.training.initialization import response_for_training
 
 from ..panorama_room import light, walls
-from .clips import pan, write_clip
+from .clips import pan, still, write_clip
 
 pytest.importorskip("av")
-
-
-def still(value=None, height=48, width=64):
-    """One frame: a ramp of grey beside patches of color, or one value."""
-    frame = np.repeat(np.linspace(0.02, 0.98, width)[None, :, None], height, 0).repeat(3, 2)
-    frame[height // 2 :, :16], frame[height // 2 :, 16:32] = (0.7, 0.2, 0.1), (0.1, 0.3, 0.8)
-    return [frame if value is None else np.full((height, width, 3), value)] * 3
-
-
-@pytest.mark.parametrize("full, tags, metadata, curve, response", [
-    (False, (18, 9, 9), {}, "HLG", "colour:ITU-R BT.2100 HLG"),
-    (True, (16, 9, 9), {}, "PQ", "colour:ST 2084"),
-    (False, (2, 9, 9), {"com.apple.quicktime.make": "Apple"}, "Apple Log Profile", "colour:Apple Log Profile"),
-    (True, (2, 9, 9), {"comment": "Apple Log"}, "Apple Log Profile", "colour:Apple Log Profile"),
-    (False, (1, 1, 1), {"comment": "S-Log3"}, "S-Log3", "colour:S-Log3"),
-    (True, (1, 1, 1), {}, "Rec.709", None),
-])  # fmt: skip
-def test_ten_bits_and_the_curve_that_a_stream_states(tmp_path, tags, metadata, curve, response, full):
-    file, frames = tmp_path / "a.mov", still()
-    write_clip(file, frames, tags=tags, metadata=metadata, full=full)
-    clip = open_clip(file)
-    assert (clip.color.curve, clip.color.response, clip.color.bits) == (curve, response, 10)
-    frame_pixels = codes(next(decode(clip))[1], clip.color) / 65535
-    inside = np.s_[4:20, 4:-4], np.s_[28:44, 4:12], np.s_[28:44, 20:28]
-    for part in inside:
-        assert np.abs(frame_pixels[part] - frames[0][part]).max() < 0.01
-        assert np.abs(frame_pixels[part] - frames[0][part]).mean() < 1.5 / 1023
-    if response is not None:
-        light = response_by_name(response).decode(frames[0][10, 4:-4])
-        np.testing.assert_allclose(
-            response_by_name(response).decode(frame_pixels[10, 4:-4]), light, rtol=0.08, atol=2e-3
-        )
-
-
-@pytest.mark.parametrize("layout, bits, shift", [
-    ("yuvj420p", 8, 0), ("yuvj422p", 8, 0), ("yuvj444p", 8, 0), ("nv12", 8, 0), ("yuv411p", 8, 0), ("gray", 8, 0),
-    ("yuv420p10le", 10, 0), ("yuv444p10le", 10, 0), ("p010le", 10, 6), ("yuv420p12le", 12, 0),
-])  # fmt: skip
-def test_greys_of_full_range_keep_their_codes(layout, bits, shift):
-    """FFmpeg widens the samples of some layouts so that white is 65535, and shifts those of others."""
-    import av
-
-    frame, kind = av.VideoFrame(256, 64, layout), np.dtype("u1" if bits == 8 else "<u2")
-    top = 2**bits - 1
-    values = np.rint(np.linspace(0, top, 256)).astype(int)
-    for number, plane in enumerate(frame.planes):
-        samples = np.full((plane.height, plane.line_size // kind.itemsize), 1 << (bits - 1 + shift), kind)
-        if number == 0:
-            samples[:, :256] = values << shift
-        plane.update(samples.tobytes())
-    frame_pixels = codes(frame, VideoColor("Rec.709", None, None, (0.2126, 0.0722), True, bits))[32]
-    expected = values if bits == 8 else np.rint(values / top * 65535)
-    assert np.abs(frame_pixels - expected[:, None]).max() <= (0 if bits == 8 else 1)
 
 
 @pytest.mark.parametrize(
@@ -99,28 +45,6 @@ def test_frames_are_turned_and_mirrored_as_the_stream_states(tmp_path, matrix, t
     frame_pixels = codes(next(decode(clip))[1], clip.color) / 65535
     assert frame_pixels.shape[1::-1] == clip.size
     assert np.abs(frame_pixels - turn(still()[0])).mean() < 0.01
-
-
-@pytest.mark.parametrize(
-    "matrix, name", [(8, "YCgCo"), (10, "constant-luminance BT.2020"), (14, "ICtCp"), (15, "IPT-C2")]
-)
-def test_samples_that_are_no_luma_are_named(tmp_path, matrix, name):
-    """PyAV issue 2149: such frames would come out in other colors, or not at all."""
-    write_clip(tmp_path / "a.mp4", still(), tags=(16, 9, matrix))
-    with pytest.raises(InputError, match=f"its frames are stored as {name}, which is not read; convert the clip"):
-        open_clip(tmp_path / "a.mp4")
-
-
-def test_dolby_vision_without_another_layer_is_named(tmp_path):
-    write_clip(tmp_path / "a.mp4", still(), tags=(2, 2, 2))
-    data = (tmp_path / "a.mp4").read_bytes()
-    (tmp_path / "a.mp4").write_bytes(data.replace(b"hev1", b"dvhe"))
-    with pytest.raises(InputError, match="is Dolby Vision of profile 5, whose colors only Dolby's decoder knows"):
-        open_clip(tmp_path / "a.mp4")
-    write_clip(tmp_path / "b.mp4", still(), tags=(18, 9, 9))
-    data = (tmp_path / "b.mp4").read_bytes()
-    (tmp_path / "b.mp4").write_bytes(data.replace(b"hev1", b"dvhe"))
-    assert open_clip(tmp_path / "b.mp4").color.curve == "HLG"
 
 
 @pytest.mark.parametrize("aspect, rotation, size", [("4/3", 0, (171, 96)), ("1/2", 0, (128, 192)),

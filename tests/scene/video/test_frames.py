@@ -3,20 +3,16 @@
 import logging
 import shutil
 import subprocess
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color.encoding import encoding_of
 from sehdr_warp.scene.color.primaries import srgb_to_linear
 from sehdr_warp.scene.file_names import list_images
 from sehdr_warp.scene.images.ldr_files import open_image, read_ldr
-from sehdr_warp.scene.lens import Lens
-from sehdr_warp.scene.video.color import codes_in_rec709
 from sehdr_warp.scene.video.decode import open_clip
 from sehdr_warp.scene.video.frames import choose_frames, frames_folder
 
@@ -76,36 +72,6 @@ def test_a_clip_and_frames_that_ffmpeg_makes_of_it_have_the_same_light(tmp_path,
         assert np.abs(frame_light - light).max() < 0.02
 
 
-@pytest.mark.parametrize("saturated", [False, True])
-def test_a_clip_within_rec709_is_converted_and_another_keeps_its_primaries(tmp_path, monkeypatch, saturated):
-    def place(dataset, _):
-        lens = Lens("SIMPLE_PINHOLE", 128, 96, (100.0, 64.0, 48.0), dataset.folder)
-        return replace(dataset, records=tuple(replace(record, lens=lens) for record in dataset.records)), []
-
-    monkeypatch.setattr("sehdr_warp.scene.load.place_photos", place)
-    response = response_by_name("colour:ITU-R BT.2100 HLG")
-    to_rec709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
-    lights, frames = [], []
-    for codes in pan(30):
-        light = 0.6 * (0.7 * codes.mean(2, keepdims=True) + 0.3 * codes)
-        wide = light @ np.linalg.inv(to_rec709).T
-        if saturated:
-            wide[:20, :30] = [0.02, 0.4, 0.02]
-        frames.append(response.encode(wide))
-        lights.append(wide @ to_rec709.T)
-    write_clip(tmp_path / "a.mov", frames, tags=(18, 9, 9), lossless=True)
-    scene = load_scene(tmp_path / "a.mov", cache=tmp_path / "cache", max_size=64)
-    assert (scene.color_matrix is None) is not saturated and scene.light_known
-    assert any("colors: the clip's lie within Rec.709" in note for note in scene.notes) is not saturated
-    for view in scene.views[::6]:
-        decoded = response.decode(view.codes / 65535) @ (np.eye(3) if scene.color_matrix is None else to_rec709).T
-        expected = lights[int(view.name.removeprefix("frame_"))].reshape(48, 2, 64, 2, 3).mean((1, 3))
-        np.testing.assert_allclose(decoded, expected, rtol=0.03, atol=2e-3)
-        assert (decoded.min() < -0.1) is np.bool_(saturated)
-    by_another = load_scene(tmp_path / "a.mov", cache=tmp_path / "cache", max_size=64, response="camera")
-    assert by_another.color_matrix is not None and not by_another.light_known
-
-
 def test_a_clip_whose_cameras_are_not_found_is_named_itself(tmp_path, monkeypatch):
     def place(dataset, _):
         raise InputError(dataset.folder, "none of the 24 photos could be placed", "bring poses")
@@ -114,11 +80,3 @@ def test_a_clip_whose_cameras_are_not_found_is_named_itself(tmp_path, monkeypatc
     write_clip(tmp_path / "a.mov", list(pan(30)))
     with pytest.raises(InputError, match=r"a\.mov: none of the 24 frames could be placed; film slowly"):
         load_scene(tmp_path / "a.mov", cache=tmp_path / "cache")
-
-
-def test_clipped_channels_stay_clipped_in_rec709():
-    response, matrix = response_by_name("linear"), np.array([[1.5, -0.4, -0.1], [-0.1, 1.1, 0.0], [0.0, -0.1, 1.1]])
-    codes = np.array([[[65535, 65535, 65535], [65535, 20000, 20000], [30000, 30000, 30000]]], np.uint16)
-    converted = codes_in_rec709(codes, response, matrix)
-    assert (converted[0, 0] == 65535).all() and converted[0, 1, 0] == 65535
-    assert (converted[0, 1, 1:] < 40000).all() and np.abs(converted[0, 2].astype(int) - 30000).max() <= 1

@@ -1,0 +1,53 @@
+"""Views from photos: averages, undistortion, transparency."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+from PIL import Image
+
+from tests.make_scenes import (
+    edit_transforms,
+    load,
+    pattern,
+    write_blender,
+    write_colmap,
+)
+
+
+def test_photos_are_averaged_side_by_side(tmp_path):
+    """In a new process, whose kernels are not loaded yet: eight threads that load one at once end it."""
+    write_colmap(tmp_path, count=16)
+    code = f"from sehdr_warp.scene import load_scene; load_scene({str(tmp_path)!r}, max_size=24, response='hdr-nerf')"
+    environment = os.environ | {"SEHDR_THREADS": "8"}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=120)
+
+
+def test_a_lens_that_leaves_little_of_the_photos_is_named(tmp_path):
+    write_blender(tmp_path, 6, size=(150, 200), fl_x=343.0, fl_y=975.0, k1=46.6, k2=-3690.0)
+    note = "lens: undistorted, 6 of 6 photos show at most "
+    assert any(line.startswith(note) for line in load(tmp_path).notes)
+    edit_transforms(tmp_path, k1=-0.3, k2=0.1)
+    assert not any(line.startswith(note) for line in load(tmp_path).notes)
+
+
+def test_transparent_pixels_show_black_light(tmp_path):
+    write_blender(tmp_path, rgba=True, camera_angle_x=0.7)
+    view = load(tmp_path, cache=tmp_path / "cache").views[0]
+    assert view.image[:, :20].max() == 0 and view.mask is None
+    note = "transparency: 6 of 6 photos have transparent pixels, which count as black light"
+    assert note in load(tmp_path, cache=tmp_path / "cache").notes
+    np.testing.assert_allclose(view.image[:, 20:], pattern(40, 30, 0)[:, 20:] / 255, atol=1e-6)
+
+
+def test_alpha_keeps_pixels_out(tmp_path):
+    write_colmap(tmp_path)
+    alpha = np.full((48, 64, 1), 255, np.uint8)
+    alpha[:12] = 0
+    Image.fromarray(np.concatenate([pattern(64, 48, 1), alpha], 2)).save(tmp_path / "images" / "001.png")
+    scene = load(tmp_path)
+    assert scene.views[1].mask[:12].max() == 0 and scene.views[1].mask[12:].min() == 1
+    np.testing.assert_array_equal(scene.views[1].image, pattern(64, 48, 1).astype(np.float32) / np.float32(255))
+    assert scene.views[2].mask is None
+    assert "transparency: 1 of 6 photos have transparent pixels, which are left out" in scene.notes

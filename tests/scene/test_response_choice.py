@@ -1,0 +1,72 @@
+"""Choice of a response for a set of photos."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sehdr_warp.response import response_by_name, selection
+from sehdr_warp.scene import load_scene
+from sehdr_warp.scene.response_choice import select_for_codes
+from tests.make_scenes import load, pattern, write_colmap
+from tests.response.mosaics import mosaic, photograph
+
+
+def test_a_response_that_is_a_guess_is_noted(tmp_path):
+    write_colmap(tmp_path, name="{:03d}.png")
+    for path in (tmp_path / "images").iterdir():
+        with Image.open(path) as photo:
+            ramp = np.linspace(30, 220, photo.width).astype(np.uint8)
+            Image.fromarray(np.broadcast_to(ramp[None, :, None], (photo.height, photo.width, 3)).copy()).save(path)
+    notes = load_scene(tmp_path).notes
+    assert sum("is a guess: curves that explain the photos as well differ" in note for note in notes) == 1
+    assert not any("is a guess" in note for note in load_scene(tmp_path, response="srgb").notes)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "told"),
+    [
+        (
+            ("NIKON D70\0\0", "PENTAX 67", "NIKON D70"),
+            ["photos of 2 cameras get one response, which fits some of them better: NIKON D70 (2), PENTAX 67 (1)"],
+        ),
+        (("NIKON D70\0\0", "NIKON D70"), []),
+    ],
+)
+def test_photos_of_several_cameras_are_told_of(tmp_path, cameras, told):
+    write_colmap(tmp_path)
+    for number, camera in enumerate(cameras):
+        path, tags = tmp_path / "images" / f"{number:03d}.png", Image.Exif()
+        tags[0x0110] = camera
+        Image.fromarray(pattern(64, 48, number)).save(path, exif=tags)
+    assert [note for note in load(tmp_path).notes if "cameras get" in note] == told
+
+
+def test_the_response_is_chosen_from_codes_as_photographed(monkeypatch):
+    """At any size the same photos are judged; what chose is noted, and another curve develops otherwise."""
+    judged = []
+
+    def select(photos, candidates, **options):
+        judged.append([photo.shape for photo in photos])
+        return SimpleNamespace(response=response_by_name("camera"), uncertainty=0.0, note=None)
+
+    monkeypatch.setattr(selection, "select_response", select)
+    scenes = [load_scene("embedded", max_size=size, candidates=("srgb", "camera")) for size in (None, 40)]
+    assert judged == [[(160, 160, 3)] * 18] * 2
+    assert all(scene.response.name == "camera" for scene in scenes)
+    assert scenes[0].chosen_by == ("posterior", ("srgb", "camera"))
+    assert scenes[0].views[0].codes.dtype == np.uint8 and scenes[1].views[0].codes.dtype == np.uint16
+    named = load_scene("embedded", max_size=40, response="hdr-nerf")
+    assert named.chosen_by is None and named.response.name == "hdr-nerf"
+    assert np.abs(named.views[0].image - scenes[1].views[0].image).max() > 1e-3
+    assert load_scene("embedded", max_size=40, response=named.response).response is named.response
+
+
+def test_a_guess_is_told():
+    ramp = np.rint(255 * np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))).astype(np.uint8)
+    note = select_for_codes([ramp], [None], "posterior", ()).note
+    assert "is a guess: curves that explain the photos as well differ from it by" in note
+    codes = [np.rint(255 * photograph("srgb", mosaic(seed))).astype(np.uint8) for seed in range(4)]
+    assert select_for_codes(codes, [None] * 4, "posterior", ()).note is None
+    assert select_for_codes(codes, [None] * 4, "paper", ()).note is None
