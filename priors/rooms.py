@@ -67,7 +67,7 @@ class LitRooms:
         self.generator = torch.Generator(device=device).manual_seed(seed)
         views, areas, stops, walls = [], [], [], []
         for first in range(0, count, AT_ONCE):
-            rooms = _Rooms(min(AT_ONCE, count - first), self.generator)
+            rooms = Rooms(min(AT_ONCE, count - first), self.generator)
             views.append(rooms.render(PIXELS, SAMPLES))
             areas.append(rooms.lamp_areas())
             stops.append(rooms.lamp_stops)
@@ -104,7 +104,7 @@ class LitRooms:
         return torch.cat([lamps, around * torch.exp2(self._uniform(count, 1, 3) - 0.5)], 1)
 
 
-class _Rooms:
+class Rooms:
     """A few random rooms, of one view each."""
 
     def __init__(self, count: int, generator: torch.Generator):
@@ -199,18 +199,18 @@ class _Rooms:
         origin, directions = self._cameras(pixels, samples)
         direct, bounce, albedo = (torch.zeros(1, device=self.device) for _ in range(3))
         for direction in directions:
-            hits = self._trace(origin[:, None].expand_as(direction), direction)
+            hits = self.trace(origin[:, None].expand_as(direction), direction)
             place = origin[:, None] + hits.distance[..., None] * direction
             seen, light, color = self._shade(place, direction, hits)
             mirrored = direction - 2 * (direction * hits.normal).sum(2, keepdim=True) * hits.normal
-            behind = self._trace(place + 1e-3 * hits.normal, mirrored)
+            behind = self.trace(place + 1e-3 * hits.normal, mirrored)
             at = place + behind.distance[..., None] * mirrored
             shine, reflected, other = self._shade(at, mirrored, behind)
             gloss = self._at(self.things.gloss, hits.index)[..., None, None]
             gloss = gloss * (hits.distance < FAR)[..., None, None]
             direct = direct + seen + color[:, :, None] * light + gloss * (shine + other[:, :, None] * reflected)
             onward = self._cosine(hits.normal)
-            next_hits = self._trace(place + 1e-3 * hits.normal, onward)
+            next_hits = self.trace(place + 1e-3 * hits.normal, onward)
             next_place = place + next_hits.distance[..., None] * onward
             glow, second, next_color = self._shade(next_place, onward, next_hits)
             glow[:, :, :LAMPS] = 0  # Lamps are in `light`
@@ -255,7 +255,7 @@ class _Rooms:
             return values.gather(1, index)
         return values.gather(1, index[..., None].expand(-1, -1, values.shape[2]))
 
-    def _trace(self, origin: Tensor, direction: Tensor) -> Hits:
+    def trace(self, origin: Tensor, direction: Tensor) -> Hits:
         """Return what rays [B, R, 3] meet first."""
         best = torch.full(origin.shape[:2], FAR, device=self.device)
         index = torch.zeros(origin.shape[:2], dtype=torch.long, device=self.device)
@@ -305,14 +305,14 @@ class _Rooms:
         sent = sent[..., None] * cells[:, :, None]
         sky = missed[..., None, None].float().expand(-1, -1, 1, 3)
         sent = torch.cat([sent, sky], 2)
-        light = [self._from_lamp(k, place, hits.normal) for k in range(LAMPS)]
+        light = [self.light_from_lamp(k, place, hits.normal) for k in range(LAMPS)]
         around = 0.6 + 0.4 * hits.normal[..., 2]
         pattern = _noise(place, self._at(things.pitch, hits.index))[..., :1]
         color = torch.where(pattern > 0, self._at(things.albedo, hits.index), self._at(things.other, hits.index))
         color = color * (~missed & (lamp < 0))[..., None]
         return sent, torch.stack([*light, around], 2)[..., None], color
 
-    def _from_lamp(self, k: int, place: Tensor, normal: Tensor) -> Tensor:
+    def light_from_lamp(self, k: int, place: Tensor, normal: Tensor) -> Tensor:
         """Return [B, R] the irradiance over pi at places from a random point of a lamp of radiance 1."""
         random = torch.rand(place.shape, generator=self.generator, device=self.device) * 2 - 1
         is_round = self.lamp_round[:, k, None, None]

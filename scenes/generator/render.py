@@ -143,7 +143,7 @@ def render_scene(mi, recipe: Recipe, out: Path, settings: Settings) -> Path:
         LOG.info("%s: %d things built in %.1f s", recipe.name, len(stage.items), time.perf_counter() - started)
         for view in missing:
             where = places[view], _aside(folder, view)
-            line = _render_view(mi, scene, recipe, cameras[view], view, settings, denoiser, *where)
+            line = render_view(mi, scene, recipe, cameras[view], view, settings, denoiser, *where)
             LOG.info("%s: view %d of %d, %s", recipe.name, view, VIEWS, line)
     _finish(mi, recipe, folder, settings, {view: cameras[view] for view in chosen}, places)
     return folder
@@ -186,7 +186,8 @@ def _check_light(radiance: np.ndarray, subject: str, remedy: str) -> None:
         raise SehdrError(f"{subject} pixels that are not finite or negative; {remedy}")
 
 
-def _render_view(mi, scene, recipe, camera, view: int, settings, denoiser, path: Path, aside: Path) -> str:
+def render_view(mi, scene, recipe, camera, view: int, settings, denoiser, path: Path, aside: Path) -> str:
+    """Render a view and write it, with what guides denoising; return a line about it."""
     started = time.perf_counter()
     sensor = _sensor(mi, camera)
     tracer = mi.load_dict({"type": "path", "max_depth": recipe.depth, "rr_depth": 6})

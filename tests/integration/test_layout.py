@@ -11,7 +11,7 @@ TOPICS = {
     "compat/gsplat": {"against_gsplat", "simple_trainer"},
     "kernels": {"cuda_compilation"},
     "output": {"blender"},
-    "rasterizer": {"culling", "extremes", "properties", "rasterize"},
+    "rasterizer": {"culling", "properties"},
     "training": {
         "bad_input", "confidence", "deterministic", "fields", "nodes", "out_of_memory", "reserved_rows", "resume",
         "units",

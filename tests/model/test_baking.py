@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.model import baking
 from sehdr_warp.model.baking import bake, field_of, fit_to_pictures, gaussians_of, psnr_of, sphere_directions
 from sehdr_warp.rasterizer import spherical_harmonics
 from sehdr_warp.response import response_by_name
@@ -30,10 +29,9 @@ def test_basis_is_that_of_the_renderer():
     np.testing.assert_allclose(by_basis, rendered, atol=2e-5)
 
 
-def test_bake_gives_back_what_harmonics_can_hold(monkeypatch):
-    monkeypatch.setattr(baking, "_CHUNK", 16)
-    start = gaussians(color_model="linear")
-    start.harmonics[:, 0] += 20  # Positive in all directions: nothing is cut off.
+def test_bake_gives_back_what_harmonics_can_hold():
+    start = gaussians(1030, color_model="linear")  # More than are baked at once.
+    start.harmonics[:, 0] += 30  # Positive in all directions: nothing is cut off.
     baked = bake(start, lambda radiance: 2 * radiance + 0.5, "display", camera_positions=np.ones((3, 3)))
     np.testing.assert_allclose(baked.harmonics, 2 * start.harmonics, atol=1e-4)
 

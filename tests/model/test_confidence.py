@@ -75,11 +75,13 @@ def view(model, mask=None):
 def test_weighted_sums_are_those_of_the_blend(device):
     model = field(device)
     images = torch.rand(12, 20, 2, generator=torch.Generator().manual_seed(0)).to(device)
-    sums = model.weighted_sums(CameraTensors.of(CAMERA, device), images)
+    camera, gaussians = CameraTensors.of(CAMERA, device), model.gaussians
+    sums = model.weighted_sums(camera, images)
     for index in range(3):
         alone = torch.zeros(3, 3, device=device)
         alone[index] = 1.0
-        weights = model._rasterize(CameraTensors.of(CAMERA, device), alone).image[..., 0]
+        shapes = gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacities()
+        weights = rasterize(*shapes, alone, camera.world_to_camera, camera.intrinsics, 20, 12).image[..., 0]
         torch.testing.assert_close(sums[index], (weights[..., None] * images).sum((0, 1)), rtol=1e-4, atol=1e-4)
     assert sums[2].abs().max() == 0 < sums[:2].min()
 

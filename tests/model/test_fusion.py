@@ -2,13 +2,14 @@
 
 import math
 from functools import partial
+from itertools import pairwise
 
 import pytest
 import torch
 
 from sehdr_warp.model.exposure import exposure_times
 from sehdr_warp.model.fusion import NeuralExposureFusion
-from sehdr_warp.rasterizer.ops.exposure_fusion import fusion_weights
+from sehdr_warp.rasterizer.ops.exposure_fusion import fuse_exposures, fusion_weights
 from sehdr_warp.response import response_by_name
 
 BASE_TIME = 2.0
@@ -24,8 +25,12 @@ def make_fusion(name="gamma-2.2", *, sharpness=1.0, **options) -> NeuralExposure
 
 def exact(fusion, log_base) -> torch.Tensor:
     """The equations for each Gaussian, without the table."""
-    encoded = fusion._encode(log_base)
-    return fusion.radiance_scale * (fusion_weights(encoded, *fusion._learned_tensors()) * encoded).sum(dim=0)
+    encoded = torch.stack(
+        [fusion.response.encode_extended((log_base + math.log(t / BASE_TIME)).exp()) for t in fusion.times]
+    )
+    (inner, outer), (inner_bias, outer_bias) = fusion.weights, fusion.biases
+    weights = fusion_weights(encoded, fusion.log_sigma, inner, inner_bias, outer, outer_bias)
+    return fusion.radiance_scale * (weights * encoded).sum(dim=0)
 
 
 def log_radiance(fusion, count=400, seed=0) -> torch.Tensor:
@@ -114,13 +119,17 @@ def test_table_matches_exact(name):
 
 
 def test_nodes_made_while_a_step_is_recorded_are_not_kept(monkeypatch):
-    fusion, colours = make_fusion(), torch.zeros(4, 3, dtype=torch.float64)
-    monkeypatch.setattr("sehdr_warp.model.fusion.is_capturing", lambda device: True)
-    recorded = fusion(colours)
-    assert not fusion._node_cache
-    monkeypatch.setattr("sehdr_warp.model.fusion.is_capturing", lambda device: False)
-    torch.testing.assert_close(fusion(colours), recorded, rtol=0, atol=0)
-    assert len(fusion._node_cache) == 1
+    fusion, colours, nodes = make_fusion(), torch.zeros(4, 3, dtype=torch.float64), []
+    fuse = "sehdr_warp.model.fusion.fuse_exposures"
+    monkeypatch.setattr(
+        fuse, lambda encoded, *rest, **scale: nodes.append(encoded) or fuse_exposures(encoded, *rest, **scale)
+    )
+    values = []
+    for is_recorded in (True, True, False, False):
+        monkeypatch.setattr("sehdr_warp.model.fusion.is_capturing", lambda device, answer=is_recorded: answer)
+        values.append(fusion(colours))
+    assert [a is b for a, b in pairwise(nodes)] == [False, False, True]
+    assert all(torch.equal(value, values[0]) for value in values)
 
 
 def test_radiance_scale():

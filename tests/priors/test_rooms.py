@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from priors import rooms
-from priors.rooms import FAR, LAMPS, WALLS, LitRooms, _Rooms
+from priors.rooms import FAR, LAMPS, WALLS, LitRooms, Rooms
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def few(monkeypatch):
 @pytest.fixture
 def empty_room():
     """Return a room of one bulb of radius 0.1, 2 meters above a place on its floor."""
-    room = _Rooms(1, torch.Generator().manual_seed(0))
+    room = Rooms(1, torch.Generator().manual_seed(0))
     for corner in (room.things.low, room.things.high):
         corner[:, WALLS : room.lamps] += FAR
     room.lamp_middle[0, 0], room.lamp_half[0, 0], room.lamp_round[0, 0] = torch.tensor([1.0, 1, 2]), 0.1, True
@@ -32,7 +32,7 @@ def test_a_bulb_lights_a_floor_by_the_square_of_its_distance(empty_room, aside):
     distance = math.hypot(2, aside)
     # Radiance 1 of a disc of radius 0.1, over pi; the cosine is 2 / distance.
     expected = 0.1**2 / distance**2 * 2 / distance
-    assert float(empty_room._from_lamp(0, place, up).mean()) == pytest.approx(expected, rel=0.03)
+    assert float(empty_room.light_from_lamp(0, place, up).mean()) == pytest.approx(expected, rel=0.03)
 
 
 def test_things_cast_shadows(empty_room):
@@ -41,14 +41,14 @@ def test_things_cast_shadows(empty_room):
         torch.tensor([1.5, 1.5, 1.1]),
     )
     place, up = torch.tensor([[[1.0, 1, 0], [9.0, 1, 0]]]), torch.tensor([0.0, 0, 1]).expand(1, 2, 3)
-    below, away = empty_room._from_lamp(0, place, up)[0].tolist()
+    below, away = empty_room.light_from_lamp(0, place, up)[0].tolist()
     assert below == 0 and away > 0
 
 
 def test_walls_have_normals_that_point_into_the_room(empty_room):
     middle = empty_room.size[:, None] / 2
     directions = torch.cat([torch.eye(3), -torch.eye(3)])[None]
-    hits = empty_room._trace(middle.expand(1, 6, 3), directions)
+    hits = empty_room.trace(middle.expand(1, 6, 3), directions)
     met = hits.distance[0] < FAR
     assert met.sum() >= 3 and torch.equal(hits.normal[0, met], -directions[0, met])
 

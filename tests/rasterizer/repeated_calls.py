@@ -21,7 +21,7 @@ def scene_of(count=80, channels=3):
 
 
 def recordings():
-    return sum(size.captured for size in cache._pools.values())
+    return sum(size.captured for size in cache.pools.values())
 
 
 def assert_alike(ours, truth):

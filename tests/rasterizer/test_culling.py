@@ -75,7 +75,7 @@ def test_a_quaternion_of_zeros_turns_nothing_and_has_no_gradient(device):
     image, grads = gradients(lambda *tensors: rasterize(*tensors, WIDTH, HEIGHT).image, [*gaussians, *shared])
     assert not grads[2][3].any() and grads[2].any()
     gaussians[2][3] = torch.tensor([1.0, 0, 0, 0])
-    assert torch.equal(rasterize(*gaussians, *shared, WIDTH, HEIGHT).image, image)
+    assert torch.equal(rasterize(*[*gaussians, *shared], WIDTH, HEIGHT).image, image)
 
 
 @pytest.mark.parametrize("place, value", BAD[:-1])

@@ -1,4 +1,4 @@
-"""The projection as a torch operation; what it computes is compared in test_rasterize.py."""
+"""The projection as a torch operation; what it computes is compared in tests/kernels."""
 
 import gc
 import weakref

@@ -25,7 +25,7 @@ from sehdr_warp.rasterizer import (
 
 from .scenes import random_scene
 
-WIDTH, HEIGHT = SIZE = 20, 14
+WIDTH, HEIGHT = 20, 14
 
 
 @wp.kernel
@@ -200,7 +200,7 @@ def test_imaginary_parts_of_conjugates_are_negated(device):
     view = torch.complex(values, values).conj().imag
     torch.testing.assert_close(cube(view), -(values**3))
     leaves = splats(device)
-    for result_of in (lambda: cube(leaves[3]), lambda: rasterize(*leaves, *SIZE).depths):
+    for result_of in (lambda: cube(leaves[3]), lambda: rasterize(*leaves, WIDTH, HEIGHT).depths):
         result = result_of()
         expected = torch.autograd.grad(-result.sum(), leaves, retain_graph=True, allow_unused=True)
         z = torch.complex(torch.zeros_like(result), result)

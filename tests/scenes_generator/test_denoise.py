@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes.generator.recipes import RECIPES, make_cameras
-from scenes.generator.render import Settings, _render_view, denoise
+from scenes.generator.render import Settings, denoise, render_view
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.scene.images.hdr_files import read_hdr
 
@@ -48,10 +48,10 @@ def test_pixels_that_are_no_light_are_refused_before_and_after_denoising(tmp_pat
     recipe, (path, aside) = RECIPES["night"], (tmp_path / "view.exr", tmp_path / "view.npz")
     camera = make_cameras(recipe.layout, 24, 24)[1]
     with pytest.raises(SehdrError, match=f"^night: {words} that are not finite or negative; take"):
-        _render_view(
+        render_view(
             mitsuba, None, recipe, camera, 1, Settings(24, 24, 4, 0), lambda *_: images["denoised"], path, aside
         )
     assert not path.exists() and not aside.exists()
     images[spoilt][3, 4] = 1.0
-    _render_view(mitsuba, None, recipe, camera, 1, Settings(24, 24, 4, 0), lambda *_: images["denoised"], path, aside)
+    render_view(mitsuba, None, recipe, camera, 1, Settings(24, 24, 4, 0), lambda *_: images["denoised"], path, aside)
     assert read_hdr(path).max() == 1.0

@@ -76,15 +76,15 @@ def pool_for(tensors: Sequence[Tensor], options: RenderOptions) -> "GraphPool | 
         if pool is None:
             differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
             pool = GraphPool(differentiable, MAX_GRAPHS if len(first) <= MAX_SINGLE_SORT else MAX_LARGE_GRAPHS)
-            _pools[CallPattern(tensors, options)] = pool
+            pools[CallPattern(tensors, options)] = pool
         pool.last_use = next(_uses)
-        while len(_pools) > MAX_POOLS:
-            del _pools[min(_pools, key=lambda pattern: _pools[pattern].last_use)]
+        while len(pools) > MAX_POOLS:
+            del pools[min(pools, key=lambda pattern: pools[pattern].last_use)]
     return pool
 
 
 def _known_pool(tensors: Sequence[Any], options: RenderOptions) -> "GraphPool | None":
-    for pattern, pool in _pools.items():
+    for pattern, pool in pools.items():
         if pattern.matches(tensors, options):
             return pool
     return None
@@ -235,13 +235,13 @@ class GraphPool:
 
 
 _lock = threading.Lock()
-_pools: dict[CallPattern, GraphPool] = {}
+pools: dict[CallPattern, GraphPool] = {}
 _uses = count(1)
 
 
 def clear_graphs() -> None:
     """Free all CUDA graphs and their memory."""
-    _pools.clear()
+    pools.clear()
 
 
 atexit.register(clear_graphs)  # CUDA graphs must be freed before CUDA is.

@@ -70,16 +70,16 @@ def without_replays() -> Iterator[None]:
 replays_are_off: Callable[[], bool] = _replays_are_off.get  # Whether this is within without_replays()
 
 
-_idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}
+idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}
 
 
-def _own_stream(owner, device: torch.device) -> torch.cuda.Stream:
+def own_stream(owner, device: torch.device) -> torch.cuda.Stream:
     """Return a stream on which nothing else captures for as long as its owner lives.
 
     Torch hands out 32 streams in turn, and in some versions the end of one capture frees the cuBLAS workspace of every
     other graph on the same stream, whose replay is then an illegal access (pytorch issue 193402).
     """
-    idle = _idle_streams.setdefault(device, [])
+    idle = idle_streams.setdefault(device, [])
     stream = idle.pop() if idle else torch.cuda.Stream(device)
     weakref.finalize(owner, idle.append, stream).atexit = False
     return stream
@@ -110,7 +110,7 @@ class CudaGraphRunner:
         self._graph: torch.cuda.CUDAGraph | None = None
         self._modules: Any = None
         self._result: Any = None
-        self.stream = stream or _own_stream(self, self.device)
+        self.stream = stream or own_stream(self, self.device)
         self._pool = torch.cuda.graph_pool_handle()
         self._idle_after_capture = 0
         # Keeps the pool's memory between captures: freed with the last graph of the pool, it would be allocated anew.

@@ -64,7 +64,7 @@ def run_ranges(function: Any, bounds: ctypes.Structure, structures: Sequence[cty
 
     if min(count, threads) < 2:
         run_worker()
-    elif gomp_parallel := _openmp_parallel():
+    elif gomp_parallel := openmp_parallel():
         run_worker(gomp_parallel)
     else:
         helpers = [_helpers(threads - 1).submit(run_worker) for _ in range(threads - 1)]
@@ -82,7 +82,7 @@ def _share_ranges() -> Any:
 
 
 @cache
-def _openmp_parallel() -> int:
+def openmp_parallel() -> int:
     """Return the address of GOMP_parallel() in torch's OpenMP library, or 0 if it has none, as on Windows.
 
     OpenMP libraries other than GNU's export it too.

@@ -67,7 +67,7 @@ def test_wrong_shapes_types_and_devices_are_named():
         with pytest.raises((ValueError, TypeError), match=message):
             rasterization(*arguments)
     with pytest.raises(ValueError, match=r"viewmats has shape \[0, 2, 4, 4\], which has no camera"):
-        rasterization(*(tensor[None][:0] for tensor in (*leaves, place[0], place[1])), *place[2:])
+        rasterization(*[*(tensor[None][:0] for tensor in (*leaves, *place[:2])), *place[2:]])
 
 
 @pytest.mark.parametrize("options", [{}, {"camera_model": "ortho"}, {"sh_degree": 1}])
@@ -131,7 +131,7 @@ def test_sizes_of_nothing_and_opacities_beyond_one_are_gsplats(device):
     with torch.no_grad():
         leaves[2][1] = -leaves[2][1]
     torch.testing.assert_close(rasterization(*leaves, **place._asdict())[0], colors)
-    truth, _, _ = rasterization(*(leaf.double() for leaf in leaves), *(each.double() for each in place[:2]), *place[2:])
+    truth, _, _ = rasterization(*[*(each.double() for each in (*leaves, *place[:2])), *place[2:]])
     torch.testing.assert_close(colors.double(), truth, rtol=1e-4, atol=1e-4)
 
 

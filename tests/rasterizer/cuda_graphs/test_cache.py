@@ -91,9 +91,9 @@ def test_renders_neither_use_nor_change_memory_that_was_freed(options, different
     for call in range(4 * CALLS):
         with torch.set_grad_enabled(differentiable):
             moved = [tensor * (1.0 - 1e-3 * call) for tensor in tensors[:5]]
-            rendering = rasterize(*moved, *tensors[5:], width, height, **options)
+            rendering = rasterize(*[*moved, *tensors[5:]], width, height, **options)
         assert all(bool(other.isnan().all()) for other in others)
-        assert_alike([rendering.image.detach()], [launched(*moved, *tensors[5:], width, height, **options).image])
+        assert_alike([rendering.image.detach()], [launched(*[*moved, *tensors[5:]], width, height, **options).image])
         images = rendering.image, rendering.transmittance
         others = [torch.full_like(like, torch.nan) for like in (*tensors, *images) for _ in range(4)]
         del moved, rendering, images
@@ -162,7 +162,7 @@ def test_packed_calls_of_gsplats_push_out_no_graphs():
         for _ in range(CALLS):
             splats = means, quaternions, log_scales.exp(), opacities, features
             rasterization(*splats, pose[None], lens, scene.width, scene.height, packed=packed)
-        assert bool(cache._pools) != packed
+        assert bool(cache.pools) != packed
 
 
 def test_renders_of_a_field_hold_no_graphs():
@@ -174,7 +174,7 @@ def test_renders_of_a_field_hold_no_graphs():
         field.render_ldr(camera)
         field.render_mean(camera, torch.ones(40, device=DEVICE))
         field.weighted_sums(field.camera_tensors(camera), torch.ones(24, 32, 2, device=DEVICE))
-    assert not cache._pools
+    assert not cache.pools
     for _ in range(CALLS):
         field.render_photo(field.camera_tensors(camera), 1.0)
     assert recordings()
@@ -216,7 +216,7 @@ def test_tensors_that_are_not_contiguous_are_read_by_their_strides():
             image = rasterize(*arguments).image
         assert_alike([image], [truth])
         assert_alike(torch.autograd.grad(image, leaves, cotangent), expected)
-    assert len(cache._pools) == 3 and all(pool.captured for pool in cache._pools.values())
+    assert len(cache.pools) == 3 and all(pool.captured for pool in cache.pools.values())
 
 
 def test_a_tensor_may_be_passed_twice():
@@ -230,7 +230,7 @@ def test_a_tensor_may_be_passed_twice():
         image = rasterize(*arguments).image
     assert_alike([image], [truth])
     assert_alike(torch.autograd.grad(image, [means], cotangent), [expected])
-    [pool] = cache._pools.values()
+    [pool] = cache.pools.values()
     assert pool.captured
 
 
@@ -260,7 +260,7 @@ def test_options_that_equal_those_of_known_calls_are_checked_as_well():
         rasterize(*scene.arguments)
     for wrong in ((float(width), height), (width, float(height))):
         with pytest.raises(TypeError, match="expected a whole number"):
-            rasterize(*tensors, *wrong)
+            rasterize(*[*tensors, *wrong])
     for eps2d in (torch.tensor(EPS2D, dtype=torch.float64), np.array([EPS2D])):
         with pytest.raises(TypeError, match="expected a number"):
             rasterize(*tensors, width, height, eps2d=eps2d)
@@ -298,7 +298,7 @@ def test_a_graph_whose_count_was_not_read_is_waited_for(monkeypatch):
     with torch.no_grad():
         for _ in range(CALLS):
             image = rasterize(*scene.arguments).image
-        (graph,) = next(iter(cache._pools.values())).idle
+        (graph,) = next(iter(cache.pools.values())).idle
         replay, count_intersections = graph._runner.replay, graph.count_intersections
         monkeypatch.setattr(graph._runner, "replay", lambda: order.append("replay") or replay())
         with monkeypatch.context() as patch, pytest.raises(OutOfMemory):

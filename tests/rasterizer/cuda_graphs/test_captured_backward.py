@@ -82,7 +82,7 @@ def test_calls_that_require_other_gradients_have_graphs_of_their_own():
         images = [[rasterize(*scene.arguments) for _ in range(CALLS)][-1].image, launched(*scene.arguments).image]
         leaves, cotangent = [scene.tensors[place] for place in required], random_like(images[0], 1)
         assert_alike(*[torch.autograd.grad(image, leaves, cotangent) for image in images])
-    assert len(cache._pools) == 3 and all(pool.captured for pool in cache._pools.values())
+    assert len(cache.pools) == 3 and all(pool.captured for pool in cache.pools.values())
 
 
 @pytest.mark.parametrize("place", [0, 1, 4])

@@ -24,15 +24,15 @@ def test_no_two_recorders_alive_record_on_one_stream(monkeypatch):
         pass
 
     places = iter(range(3))
-    monkeypatch.setattr(cuda_graphs, "_idle_streams", {})
+    monkeypatch.setattr(cuda_graphs, "idle_streams", {})
     monkeypatch.setattr(torch.cuda, "Stream", lambda device: (device, next(places)))
     device = torch.device("cuda:0")
     first, second, third = Owner(), Owner(), Owner()
-    streams = [cuda_graphs._own_stream(owner, device) for owner in (first, second)]
+    streams = [cuda_graphs.own_stream(owner, device) for owner in (first, second)]
     assert streams[0] != streams[1]
     del first
-    assert cuda_graphs._own_stream(third, device) == streams[0]
-    assert cuda_graphs._own_stream(Owner(), device) == (device, 2), "taken anew, as both others are in use"
+    assert cuda_graphs.own_stream(third, device) == streams[0]
+    assert cuda_graphs.own_stream(Owner(), device) == (device, 2), "taken anew, as both others are in use"
 
 
 def test_work_on_a_capture_stream_is_launched(monkeypatch):

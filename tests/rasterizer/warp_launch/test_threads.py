@@ -26,8 +26,8 @@ def three_threads(monkeypatch):
 def means(request, monkeypatch):
     """How threads are had: torch's OpenMP, where it has one, or helpers of our own."""
     if request.param == "helpers":
-        monkeypatch.setattr(threads, "_openmp_parallel", lambda: 0)
-    elif not threads._openmp_parallel():
+        monkeypatch.setattr(threads, "openmp_parallel", lambda: 0)
+    elif not threads.openmp_parallel():
         pytest.skip("torch has no OpenMP here")
 
 
