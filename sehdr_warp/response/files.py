@@ -173,7 +173,7 @@ def _json_curve(path: Path) -> Response:
         raise InputError(path, str(error), remedy) from error
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, f"has no two lists of numbers ({error!r})", remedy) from error
-    return TabulatedResponse(str(fields.get("name", path.stem)), exposures, values, source=str(path))
+    return TabulatedResponse(str(fields.get("name", path.name)), exposures, values, source=str(path))
 
 
 def _cube(path: Path, text: str, selector: str | None) -> Response:
@@ -194,8 +194,8 @@ def _cube(path: Path, text: str, selector: str | None) -> Response:
     axis = np.linspace(low, high, len(table))
     exposures, values = (table.T, axis.T) if selector == "decode" else (axis.T, table.T)
     if np.ptp(exposures, axis=0).max() == 0 and np.ptp(values, axis=0).max() == 0:
-        return TabulatedResponse(path.stem, exposures[0], values[0], source=str(path))
-    return ChannelResponse(path.stem, exposures, values, source=str(path))
+        return TabulatedResponse(path.name, exposures[0], values[0], source=str(path))
+    return ChannelResponse(path.name, exposures, values, source=str(path))
 
 
 def _text_curve(path: Path, text: str) -> Response:
@@ -214,5 +214,5 @@ def _text_curve(path: Path, text: str) -> Response:
                 raise InputError(path, f"line {number} is {line.strip()[:40]!r}", "give numbers alone") from None
     if rows and len(rows[0]) == 4:
         exposures, *values = np.array(rows).T
-        return ChannelResponse(path.stem, [exposures] * 3, values, source=str(path))
-    return TabulatedResponse(path.stem, *np.array(rows).reshape(-1, 2).T, source=str(path))
+        return ChannelResponse(path.name, [exposures] * 3, values, source=str(path))
+    return TabulatedResponse(path.name, *np.array(rows).reshape(-1, 2).T, source=str(path))

@@ -75,7 +75,7 @@ def test_table_file(tmp_path, separator):
     rows = [("exposure", "value"), (0, 0), (0.25, 0.5), (1, 1), (1.5, 1)]
     path.write_text("# measured\n" + "".join(f"{x}{separator}{value}\n" for x, value in rows))
     curve = response_by_name(path)
-    assert curve.name == "camera" and curve.clip_exposure == pytest.approx(1.0)
+    assert curve.name == "camera.csv" and curve.clip_exposure == pytest.approx(1.0)
     np.testing.assert_allclose(curve.encode([0, 0.25, 1]), [0, 0.5, 1], atol=1e-4)
 
 
