@@ -6,7 +6,6 @@ TESTS = Path(__file__).resolve().parents[1]
 ROOT = TESTS.parent
 NOT_PACKAGES = {"integration", "fuzz", "trial", "scenes_generator"}
 TOPICS = {
-    "benchmarks": {"bench"},
     "blocks": {"shared_decisions", "slurm"},
     "compat/gsplat": {"against_gsplat", "simple_trainer"},
     "kernels": {"cuda_compilation"},

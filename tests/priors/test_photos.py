@@ -1,27 +1,13 @@
 """Simulated photos of the prior's training: what clips has its truth, and a seed gives the same photos."""
 
-import tomllib
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from priors import rooms
-from priors.families import FAMILIES, Families
 from priors.pack import curves
-from priors.panoramas import SOURCES, Pack, from_differences, from_rgbe, listed_sources, to_differences, to_rgbe
+from priors.panoramas import Pack
 from priors.photo_values import averaged
 from priors.photos import Camera
-
-
-@pytest.fixture
-def pack(tmp_path):
-    rng = np.random.default_rng(0)
-    panoramas = np.float32(rng.lognormal(0, 1.5, (2, 32, 64, 3)))
-    panoramas[:, 8:11, 20:24] = 400.0
-    rooms = np.float32(rng.lognormal(0, 1, (3, 2, 40, 40, 3)))
-    return Pack(panoramas, np.array([False, True]), ["a", "b"], rooms, curves(tmp_path / "none.mat"))
 
 
 def test_clipped_values_are_above_white_and_others_are_decoded(pack):
@@ -41,24 +27,6 @@ def test_a_seed_gives_the_same_photos_and_another_gives_others(pack, plain):
     for name in ("exposure", "clipped", "truth"):
         assert torch.equal(getattr(first, name), getattr(again, name))
     assert not torch.equal(first.exposure, other.exposure)
-
-
-def test_rgbe_keeps_radiance_to_a_percent():
-    radiance = np.float32(10.0 ** np.random.default_rng(0).uniform(-4, 4, (50, 1)) * [1.0, 0.8, 0.6])
-    np.testing.assert_allclose(from_rgbe(to_rgbe(radiance)), radiance, rtol=0.01)
-    assert (from_rgbe(to_rgbe(np.zeros((2, 3), np.float32))) == 0).all()
-
-
-def test_differences_keep_every_byte():
-    packed = np.random.default_rng(0).integers(0, 256, (3, 2, 8, 16, 4), dtype=np.uint8)
-    np.testing.assert_array_equal(from_differences(to_differences(packed)), packed)
-
-
-def test_some_sources_are_held_out_and_none_is_one_that_weights_are_checked_on():
-    sources, listed = listed_sources(), tomllib.loads(SOURCES.read_text())
-    assert len({source.name for source in sources}) == len(sources) == 107
-    assert sum(source.held_out for source in sources) == len(listed["held_out"]) == 11
-    assert not {Path(source.file).stem for source in sources} & {*listed["checked"], *listed["checked_more"]}
 
 
 def lamp_and_window(tmp_path, brighter: str) -> Pack:
@@ -173,19 +141,3 @@ def test_varied_panoramas_have_other_contrasts_and_orders_of_channels(pack):
     )
     assert not torch.equal(same.exposure, varied.exposure) and (varied.truth >= 0).all()
     assert (varied.truth[varied.clipped == 0] == 0).all()
-
-
-def test_a_batch_has_each_family_in_its_share_and_repeats_by_its_seed(pack, monkeypatch):
-    monkeypatch.setattr(rooms, "PIXELS", 16)
-
-    def batches(count):
-        lit_rooms = rooms.LitRooms(2, "cpu", 0)
-        families = Families(pack, "cpu", np.array([0]), rooms=True, seed=3, lit_rooms=lit_rooms)
-        return families.take(count, 2, 64)
-
-    first, again = batches(20), batches(20)
-    assert [len(photos.truth) for photos in first] == [20, 20]
-    assert all(torch.equal(a.truth, b.truth) for a, b in zip(first, again, strict=True))
-    assert not torch.equal(first[0].truth, first[1].truth)
-    overexposed = first[0].clipped.amax(1).mean((1, 2))[7:10]
-    assert overexposed.min() > 0.05 and sum(share for share, _ in FAMILIES.values()) == pytest.approx(1)

@@ -1,35 +1,12 @@
 """Learning rates over a training, and the moving average that it ends with."""
 
-from math import nan
-
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.ops.step_updates import decide_step, finiteness_of
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.optimizer import load_optimizer_tensors, make_optimizer, optimizer_tensors
 
 from .toy import VARIANTS, toy_field
-
-
-@pytest.mark.parametrize("overflow", [None, False, True])
-@pytest.mark.parametrize("bad", [False, True])
-def test_a_guarded_step_is_made_or_left_out_whole(device, overflow, bad):
-    field = toy_field().to(device)
-    optimizer = make_optimizer(field, load_config("default"))
-    means = field.gaussians.means
-    before = means.detach().clone()
-    loss = (means * (nan if bad else 1.0)).sum()
-    loss.backward()
-    flag = None if overflow is None else torch.tensor(overflow, device=device)
-    step_counters = torch.zeros(3, dtype=torch.int64, device=device)
-    flags = decide_step(loss, finiteness_of([means.grad]), flag, step_counters)
-    optimizer.step(flags)
-    step = flags.applied
-    assert step_counters.tolist() == [bad, 0, 0]
-    assert bool(step) == (not bad and not overflow)
-    assert torch.equal(means, before) == (not bool(step))
-    assert float(optimizer.state[means]["step"]) == float(step)
 
 
 @pytest.mark.parametrize(("iterations", "batch", "interval"), [(4000, 1, 2), (3999, 1, 1), (8000, 2, 2), (7999, 2, 1)])
