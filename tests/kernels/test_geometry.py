@@ -64,14 +64,6 @@ def test_rotations_are_scipys_whatever_the_length(device, dtype, bound, length):
 
 
 @pytest.mark.parametrize(("dtype", "_"), BOUNDS)
-def test_no_quaternion_turns_nothing(device, dtype, _):
-    leaf = torch.zeros(1, 4, dtype=dtype, device=device, requires_grad=True)
-    matrix = rotations(leaf)
-    matrix.sum().backward()
-    assert torch.equal(matrix[0].cpu(), torch.eye(3, dtype=dtype)) and not leaf.grad.any()
-
-
-@pytest.mark.parametrize(("dtype", "_"), BOUNDS)
 def test_ellipses_meet_the_rectangles_that_their_points_are_in(device, dtype, _):
     rng = np.random.default_rng(0)
     count, cutoff = 400, 9.0

@@ -163,27 +163,6 @@ def test_gradients_are_finite_where_nothing_has_a_slope(device):
         assert all(float(grads[3][i]) == 0 for i in (0, 4)) and float(grads[3][1]) != 0
 
 
-def test_a_scene_is_found_from_a_latlong_picture(device):
-    """Colors, sizes and places that were disturbed."""
-    truth, directions = gaussians(40, dtype=torch.float32, device=device, size=-1), latlong(64, torch.float32, device)
-    position, generator = torch.zeros(3, device=device), torch.Generator().manual_seed(0)
-    options = {"focal_length": FOCAL, "pixel_angle": 0.1}
-    exact, _ = rasterize_directions(*truth, position, directions, **options)
-    leaves = [
-        (part + 0.1 * torch.randn(part.shape, generator=generator).to(device)).requires_grad_()
-        for part in (*truth[:3], truth[4])
-    ]
-    optimizer, losses = torch.optim.Adam(leaves, lr=0.02), []
-    for _ in range(60):
-        image, _ = rasterize_directions(*leaves[:3], truth[3], leaves[3], position, directions, **options)
-        loss = (image - exact).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        losses.append(float(loss.detach()))
-        optimizer.step()
-    assert losses[-1] < 0.05 * losses[0]
-
-
 def test_larger_pixels_keep_the_light(device):
     """A faint speck, far smaller than a pixel of either map."""
     mean = torch.tensor([[0.3, 0.4, 2.0]], device=device)

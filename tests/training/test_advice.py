@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.config_flags import parse_field
-from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene.pose_conventions import MISFIT
 from sehdr_warp.training.advice import FinishedTraining, advice_on, option_words, options_of_run
 from sehdr_warp.training.train import train
@@ -176,16 +175,3 @@ def test_cameras_are_found_anew_from_all_photos():
         [line] = advice_on(SimpleNamespace(scene=rig, **facts), {"path": "set"}, {})
         assert line.startswith("the cameras that the set states do not fit its photos")
         assert line.endswith(f"{end} --out r --overwrite")
-
-
-def test_a_finished_run_goes_on_with_more_iterations(tmp_path, logged):
-    config = {"schedule.iterations": 24, "plan.enabled": False}
-    train(toy_scene(), tmp_path / "run", config, device="cpu")
-    first = load_run(tmp_path / "run").metrics()
-    run = train(toy_scene(), tmp_path / "run", config | {"schedule.iterations": 48}, device="cpu", resume=True)
-    assert run.iterations == 48 and run.summary()["finished"] and run.summary()["iteration"] == 48
-    assert load_run(tmp_path / "run").config.schedule.iterations == 48
-    assert any("the finished training goes on from 24 to 48 iterations" in line for line in logged)
-    assert [line["iteration"] for line in run.metrics()][: len(first)] == [line["iteration"] for line in first]
-    # Without a config it is the longer training that is resumed, which has ended.
-    assert train(toy_scene(), tmp_path / "run", device="cpu", resume=True).iterations == 48

@@ -207,6 +207,7 @@ def test_a_preset_in_python_does_not_stretch_a_run_and_stated_iterations_do(scen
     assert sum("the run keeps its 3 iterations, not the preset's 1500" in line for line in logged) == 2
     longer = load_config("fast", {"schedule.iterations": 4})
     assert train(scene, tmp_path / "run", longer, device="cpu", resume=True).iterations == 4
+    assert any("the finished training goes on from 3 to 4 iterations" in line for line in logged)
     train(scene, tmp_path / "fields", {"schedule.iterations": 2}, device="cpu")
     stated = (({"seed": 0}, 2), ({"schedule.iterations": 3}, 3), ({"schedule": {"iterations": 4}}, 4))
     for fields, iterations in stated:

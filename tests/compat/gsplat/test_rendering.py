@@ -56,27 +56,6 @@ def test_harmonics_depths_and_the_far_plane(device):
     assert info["n_cameras"] == 2 and info["width"] == WIDTH and info["means2d"].shape == (2, COUNT, 2)
 
 
-def test_absolute_gradients_are_sums_over_pixels(device):
-    """Each pixel differentiated alone; where all of them pull one way they are the gradient."""
-    generator = torch.Generator().manual_seed(2)
-    leaves, _ = scene(device, count=6)
-    leaves = [leaf.detach().double().requires_grad_() for leaf in leaves]
-    pose = torch.eye(4, dtype=torch.float64, device=device)[None]
-    pose[:, 2, 3] = 3.0
-    lens = torch.tensor([[[12.0, 0, 8], [0, 12.0, 6], [0, 0, 1]]], dtype=torch.float64, device=device)
-    colors, alphas, info = rasterization(*leaves, pose, lens, 16, 12, packed=False, absgrad=True, render_mode="RGB+D")
-    weights = torch.randn(colors.shape, generator=generator, dtype=torch.float64).to(device)
-    by_alpha = torch.randn(alphas.shape, generator=generator, dtype=torch.float64).to(device)
-    energy = (colors * weights).sum(-1) + (alphas * by_alpha).sum(-1)
-    sums = torch.zeros_like(info["means2d"])
-    for y in range(12):
-        for x in range(16):
-            sums += torch.autograd.grad(energy[0, y, x], info["means2d"], retain_graph=True)[0].abs()
-    energy.sum().backward()
-    assert (sums > 0).any()
-    torch.testing.assert_close(info["means2d"].absgrad, sums, rtol=1e-6, atol=1e-9)
-
-
 def test_batch_axes_are_scenes_of_their_own(device):
     leaves, place = scene(device)
     pose, lens = place[:2]
