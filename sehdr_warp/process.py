@@ -24,7 +24,7 @@ _LIBRARIES = 400_000  # Objects of torch's and Warp's modules, about
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of malloc.h
 _IMPORTS = "<frozen importlib._bootstrap>"  # File of the frames of an import
 _POOLS = os.path.join("concurrent", "futures", "thread.py")  # Of those of a thread pool
-_LONGEST_IMPORT = 10.0  # Seconds that a signal waits for an import, before it ends the process as it is
+LONGEST_IMPORT = 10.0  # Seconds that a signal waits for an import, before it ends the process as it is
 _LOOK_EVERY = 0.02
 _interrupted = -_SOON
 _resender: threading.Thread | None = None
@@ -190,10 +190,10 @@ def _must_complete(frame: FrameType | None) -> bool:
 
 
 def _resend(number: int) -> None:
-    """Send a signal to the main thread when it may end, or end the process after _LONGEST_IMPORT seconds."""
+    """Send a signal to the main thread when it may end, or end the process after LONGEST_IMPORT seconds."""
     main = threading.main_thread().ident
     assert main is not None
-    end = time.monotonic() + _LONGEST_IMPORT
+    end = time.monotonic() + LONGEST_IMPORT
     while time.monotonic() < end:
         time.sleep(_LOOK_EVERY)
         if not _must_complete(sys._current_frames().get(main)):

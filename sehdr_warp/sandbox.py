@@ -19,7 +19,7 @@ import numpy as np
 from .errors import InputError
 
 _MEMORY, _MEMORY_PER_BYTE = 1 << 30, 16
-_SECONDS, _BYTES_PER_SECOND = 25, 10 << 20
+MOST_SECONDS, _BYTES_PER_SECOND = 25, 10 << 20
 # Each thread reserves address space, of which there is a bound.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"), "1")
 
@@ -40,7 +40,7 @@ def read_sandboxed(read: Callable[[Path], dict[str, np.ndarray]], path: Path, ki
         raise InputError(path, "file not found", "check the name")
     size = path.stat().st_size
     words = (read.__module__, read.__name__, str(path), str(_MEMORY + _MEMORY_PER_BYTE * size))
-    seconds = _SECONDS + size / _BYTES_PER_SECOND
+    seconds = MOST_SECONDS + size / _BYTES_PER_SECOND
     try:
         result = start(words, seconds)
     except OSError as error:

@@ -14,7 +14,7 @@ from sehdr_warp import __version__, cli
 from sehdr_warp.response import response_names
 from sehdr_warp.runs.config_files import config_fields, load_config, preset_names
 from sehdr_warp.runs.config_flags import flag_of
-from sehdr_warp.training.commands import _ending
+from sehdr_warp.training.commands import next_commands
 
 from .refusals import call
 
@@ -202,11 +202,11 @@ def test_a_training_ends_by_saying_what_to_type_next(run, capsys):
 def test_commands_to_type_next_stand_a_folder_with_spaces():
     run = Path("runs/my castle")
     summary = {"metrics": [], "iteration": 30, "gaussians": 5, "train_seconds": 1.0, "device": "cpu"}
-    typed = [line.split(":", 1)[1] for line in _ending(run, summary).splitlines()[1:]]
+    typed = [line.split(":", 1)[1] for line in next_commands(run, summary).splitlines()[1:]]
     for command in "; ".join(typed).split(";"):
         words = shlex.split(command)
         assert words[0] == "sehdr-warp" and words[2] == str(run)
-    assert "--cameras train --evs" in _ending(run, summary)  # Without held-out views render has none by default.
+    assert "--cameras train --evs" in next_commands(run, summary)  # Without held-out views render has none by default.
 
 
 def test_fields_named_on_the_command_line_override_the_preset_and_stay(capsys):

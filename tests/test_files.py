@@ -1,6 +1,5 @@
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -9,7 +8,7 @@ import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.files import atomic_folder, atomic_path, has_file, read_bytes, read_json, read_lines, write_json
-from sehdr_warp.own_files import LIST, is_as_listed, list_folder
+from sehdr_warp.own_files import LIST
 from sehdr_warp.splats import read_gaussians
 
 from .full_disk import full_disk
@@ -42,24 +41,6 @@ def test_existing_file_is_kept_unless_asked(tmp_path):
     assert "\n" not in str(caught.value)
     write(target, "new", overwrite=True)
     assert target.read_text() == "new"
-
-
-@pytest.mark.parametrize("change", ["never ours", "changed since", "another name", "no list"])
-def test_what_this_program_did_not_write_is_never_replaced(tmp_path, change):
-    target = tmp_path / "a.txt"
-    write(tmp_path / "b.txt" if change == "another name" else target, "ours")
-    if change == "another name":
-        (tmp_path / "b.txt").rename(target)
-    elif change == "no list":
-        (tmp_path / LIST).unlink()
-    else:
-        target.write_text("theirs")
-    if change == "never ours":
-        (tmp_path / LIST).write_bytes(b"\xff\n" * 3)
-    content = target.read_text()
-    with pytest.raises(InputError, match="a.txt: was not written by sehdr-warp, or was changed since"):
-        write(target, overwrite=True)
-    assert target.read_text() == content and listing(tmp_path) == ["a.txt"]
 
 
 def test_links_devices_and_pipes_are_never_replaced(tmp_path):
@@ -95,29 +76,6 @@ def test_what_has_the_name_of_a_file_is_not_taken_for_a_missing_one(tmp_path):
     for name in ("folder", "link", "pipe"):
         with pytest.raises(InputError, match="not a file; remove it"):
             has_file(tmp_path / name)
-
-
-def test_damage_to_a_listed_folder_is_found(tmp_path):
-    def make_folder():
-        folder = tmp_path / "set"
-        shutil.rmtree(folder, ignore_errors=True)
-        (folder / "deep").mkdir(parents=True)
-        for name in ("a", "deep/b", "deep/\udcff\n"):
-            (folder / name).write_text(name.encode("utf-8", "replace").decode())
-        list_folder(folder)
-        return folder
-
-    changes = [
-        lambda folder: (folder / "a").write_text("b"),
-        lambda folder: (folder / "deep" / "b").unlink(),
-        lambda folder: (folder / LIST).write_text(""),
-        lambda folder: (folder / LIST).unlink(),
-    ]
-    assert is_as_listed(make_folder())
-    for change in changes:
-        folder = make_folder()
-        change(folder)
-        assert not is_as_listed(folder)
 
 
 def test_file_that_appears_meanwhile_is_kept(tmp_path):
@@ -200,6 +158,8 @@ def test_json_has_no_nan(tmp_path):
 
 
 HEAD = "import os, signal; from pathlib import Path; from sehdr_warp import files\n"
+
+
 DIE = "def die(*_, **__): os.kill(os.getpid(), signal.SIGKILL)\n"
 
 

@@ -29,10 +29,10 @@ def test_bounds(tmp_path, monkeypatch):
     stored = sandbox.read_sandboxed(read_args, tmp_path / "a", "x", "y")
     assert bytes(stored["read"]) == b"abc" and str(stored["word"]) == "é"
     for read, seconds, message in (
-        (fills_memory, sandbox._SECONDS, "a: cannot be read as x .*allocate"),
+        (fills_memory, sandbox.MOST_SECONDS, "a: cannot be read as x .*allocate"),
         (never_ends, 1, "not read after 1 s"),
     ):
-        monkeypatch.setattr(sandbox, "_SECONDS", seconds)
+        monkeypatch.setattr(sandbox, "MOST_SECONDS", seconds)
         with pytest.raises(InputError, match=message):
             sandbox.read_sandboxed(read, tmp_path / "a", "x", "y")
 

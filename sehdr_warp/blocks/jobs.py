@@ -207,7 +207,7 @@ def slurm_executor(logs: Path, options: Mapping[str, str], *, gpu: bool) -> Any:
 
     try:
         executor = submitit.AutoExecutor(folder=logs, cluster="slurm")
-        executor.update_parameters(name="sehdr-warp", **_slurm_parameters(options, gpu=gpu))
+        executor.update_parameters(name="sehdr-warp", **slurm_parameters(options, gpu=gpu))
     except (RuntimeError, ValueError, NameError, TypeError, AssertionError) as error:
         problem = (str(error).splitlines() or [type(error).__name__])[0].partition(". Valid")[0]
         raise SehdrError(
@@ -222,7 +222,7 @@ def _submitit() -> Any:
     return require_extra("submitit", "submitit, which runs trainings as jobs, is not installed", "blocks")
 
 
-def _slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any]:
+def slurm_parameters(options: Mapping[str, str], *, gpu: bool) -> dict[str, Any]:
     """Return the parameters of submitit for SLURM: one GPU a job, and `time` in minutes."""
     parameters: dict[str, Any] = {"timeout_min": DAY} | ({"gpus_per_node": 1} if gpu else {})
     for name, text in options.items():

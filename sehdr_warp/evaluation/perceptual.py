@@ -36,7 +36,7 @@ class _Fire(nn.Module):
         return torch.cat([self.expand1x1(x).relu(), self.expand3x3(x).relu()], 1)
 
 
-def _squeezenet_features() -> nn.Sequential:
+def squeezenet_features() -> nn.Sequential:
     """Return SqueezeNet 1.1 up to its last fire module, with layers numbered as in torchvision."""
     channels, layers = 64, [nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()]
     for widths in ((64, 64), (128, 128), (192, 192, 256, 256)):  # Widths of the fire modules between two poolings.
@@ -101,7 +101,7 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
     if not backbones or not heads.is_file():
         missing = "squeeze.pth" if backbones else "a SqueezeNet 1.1 backbone (squeezenet1_1_features.pth)"
         return None, f"{folder} lacks {missing}"
-    features, state = _squeezenet_features(), _tensors(backbones[0])
+    features, state = squeezenet_features(), _tensors(backbones[0])
     backbone = {name.removeprefix("features."): state[name] for name in state if not name.startswith("classifier.")}
     try:
         features.load_state_dict(backbone)

@@ -242,7 +242,7 @@ def _print_plan(args: Train) -> None:
 def _print_result(args: Train, run: "Run", advice: Sequence[str] = ()) -> None:
     """Print what a training wrote, and advice on it."""
     summary = run.summary() | {"run": str(run.path), "metrics": run.metrics(), "advice": [*advice]}
-    print(json.dumps(summary) if args.output.json else "\n".join([_ending(run.path, summary), *advice]))
+    print(json.dumps(summary) if args.output.json else "\n".join([next_commands(run.path, summary), *advice]))
 
 
 def _uses_blocks(args: Train) -> bool:
@@ -338,7 +338,7 @@ def _config(args: Train, saved: "Config | None") -> "Config":
     return override_config(config, {"plan.keep": sorted(user_fields)})
 
 
-def _ending(path: Path, summary: dict) -> str:
+def next_commands(path: Path, summary: dict) -> str:
     """Return the lines that end a training: its result, and what to type next."""
     from .run_output import format_scores
 

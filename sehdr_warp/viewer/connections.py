@@ -104,40 +104,40 @@ class Connections:
 
     def __init__(self) -> None:
         """Begin without connections."""
-        self._open: dict[socket.socket, Connection] = {}
+        self.by_socket: dict[socket.socket, Connection] = {}
         self._changed = threading.Condition()
 
     def add(self, client: socket.socket) -> bool:
         """Register a connection; return False if there are too many and each of them is being answered."""
         with self._changed:
-            if len(self._open) >= MOST_CONNECTIONS:
+            if len(self.by_socket) >= MOST_CONNECTIONS:
                 now = time.monotonic()
-                idle = max(self._open.values(), key=lambda each: each.idle_for(now))
+                idle = max(self.by_socket.values(), key=lambda each: each.idle_for(now))
                 if idle.idle_for(now) < 0:
                     return False
-                del self._open[idle.socket]
+                del self.by_socket[idle.socket]
                 idle.close()
-            self._open[client] = Connection(client, self)
+            self.by_socket[client] = Connection(client, self)
             return True
 
     def remove(self, client: socket.socket) -> None:
         """Forget a connection that has ended."""
         with self._changed:
-            self._open.pop(client, None)
+            self.by_socket.pop(client, None)
             self._changed.notify_all()
 
     def of(self, client: socket.socket) -> Connection:
         """Return the connection of a socket; raise ClientGone if it was closed for another."""
         with self._changed:
             try:
-                return self._open[client]
+                return self.by_socket[client]
             except KeyError:
                 raise ClientGone from None
 
     def close(self) -> None:
         """Close all connections."""
         with self._changed:
-            for each in self._open.values():
+            for each in self.by_socket.values():
                 each.close()
 
     @contextmanager
@@ -159,12 +159,12 @@ class Connections:
         end = time.monotonic() + _ROOM_WAIT
         with self._changed:
             while (
-                by_others := sum(each.reserved_bytes for each in self._open.values() if each is not connection)
+                by_others := sum(each.reserved_bytes for each in self.by_socket.values() if each is not connection)
             ) and by_others + connection.reserved_bytes + size > MOST_BYTES:
                 now = time.monotonic()
                 if now > end:
                     raise BusyError
-                stalled = max(self._open.values(), key=lambda each: each.stalled_for(now))
+                stalled = max(self.by_socket.values(), key=lambda each: each.stalled_for(now))
                 if stalled is not connection and stalled.stalled_for(now) > SHORT_STALL:
                     stalled.close()
                     stalled.since = now  # Its thread takes a moment to end.

@@ -41,7 +41,7 @@ class LiveTraining(ViewerScene):
         self._thread: threading.Thread | None = None
         self._steps = 0
         self._requests: queue.Queue[Callable[[], None]] = queue.Queue()
-        self._credit = self._spent = 0.0
+        self._credit = self.picture_seconds = 0.0
         self._curve: list[tuple] = []
         self._progress: dict[str, Any] = {}
 
@@ -134,7 +134,7 @@ class LiveTraining(ViewerScene):
         answer()
         duration = time.perf_counter() - started
         if not self.paused:
-            self._spent += duration
+            self.picture_seconds += duration
             self._credit -= duration
 
     def _tell(self, step: Any, elapsed: float) -> None:
@@ -145,7 +145,7 @@ class LiveTraining(ViewerScene):
         if len(self._curve) > MOST_POINTS:
             self._curve = self._curve[::2]
         remaining = None if step.seconds_left is None else format_seconds(step.seconds_left)
-        share = self._spent / max(elapsed, 1e-9)
+        share = self.picture_seconds / max(elapsed, 1e-9)
         self._progress = {"iteration": step.iteration, "total": step.total, "left": remaining, "share": share} | figures
 
 

@@ -1,6 +1,8 @@
 """A town as survey photos, and as two trained blocks, for all tests of blocks."""
 
 import os
+import shutil
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -18,6 +20,8 @@ from sehdr_warp.blocks.job import train_block
 from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.training.launch import installed_versions
+
+from .cluster import SCRIPTS
 
 LITTLE = {"model.initial_density": 0.0, "mcmc.seed_fraction": 0.0, "loss.light_prior": False}
 
@@ -100,3 +104,31 @@ def jobs_here(monkeypatch):
         return SimpleNamespace(done=lambda: True, exception=lambda: None, result=lambda: result)
 
     monkeypatch.setattr(jobs, "local_executors", lambda _, slots, __: [SimpleNamespace(submit=submit)] * slots)
+
+
+@pytest.fixture(scope="module")
+def divided(survey, divide, tmp_path_factory):
+    """A folder with photos in `town` and a plan of two blocks in `run`, and the plan."""
+    folder = tmp_path_factory.mktemp("divided")
+    shutil.copytree(survey, folder / "town")
+    return folder, divide(folder / "town", folder / "run", iterations=20)
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """Scripts in place of SLURM's programs; the folder of its jobs."""
+    submitit = pytest.importorskip("submitit")
+    if sys.platform != "linux":
+        pytest.skip("SLURM runs on Linux")
+    programs, jobs = tmp_path / "bin", tmp_path / "jobs"
+    jobs.mkdir()
+    programs.mkdir()
+    for name, text in SCRIPTS.items():
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    monkeypatch.setenv("CLUSTER", str(jobs))
+    # submitit asks for states every ten minutes, and waits for what a dead process may still write.
+    monkeypatch.setattr(submitit.SlurmJob.watcher, "_delay_s", 1)
+    monkeypatch.setattr(submitit.SlurmJob, "_results_timeout_s", 1)
+    return jobs

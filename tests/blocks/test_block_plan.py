@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from sehdr_warp.blocks.block_plan import FILE, MOST_BLOCKS, Block, BlockPlan
+from sehdr_warp.blocks.block_plan import FILE, MOST_BLOCKS, Block, BlockPlan, blocks_for
 from sehdr_warp.blocks.train import train_in_blocks
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import Config
+from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.training.compensation import SharedDecisions
@@ -116,3 +117,13 @@ def test_links_in_the_run_are_not_followed(tmp_path, plan, flag, place):
     with pytest.raises(InputError, match="is a link"):
         train_in_blocks(DATA, tmp_path / "run", Config(), 2, device=torch.device("cpu"), **{flag: True})
     assert {path: path.read_bytes() for path in theirs.iterdir()} == before
+
+
+def test_the_number_of_blocks_follows_photos_and_gaussians():
+    config = Config()
+    assert blocks_for(400, 400 * 1e6, config) == 1
+    assert blocks_for(1200, 1200 * 1e6, config) == 4, "30,000 steps are for 400 photos"
+    assert blocks_for(20_000, 20_000 * 20e6, config) == 65
+    assert blocks_for(300, 300 * 100e6, config) == 9, "3 million Gaussians for each"
+    named = override_config(config, {"densification.cap_max": 10**6, "plan.keep": ["densification.cap_max"]})
+    assert blocks_for(300, 300 * 100e6, named) == 1

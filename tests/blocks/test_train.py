@@ -1,32 +1,28 @@
 """A survey trained in blocks through the command line: jobs, kills, merging, and uses of the merged run."""
 
 import json
-import os
 import re
 import signal
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from sehdr_warp.blocks import jobs
-from sehdr_warp.blocks.block_plan import BlockPlan, blocks_for
-from sehdr_warp.blocks.estimate import estimate
+from sehdr_warp.blocks.block_plan import BlockPlan
 from sehdr_warp.blocks.job import folder_of
-from sehdr_warp.runs.config import Config
-from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.scene import load_scene
 from sehdr_warp.splats import read_gaussians
-from sehdr_warp.training.plan import make_plan
 
 from ..refusals import call, refused
 
 submitit = pytest.importorskip("submitit")
+
+
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+
 
 FLAGS = ["--device", "cpu", "--response", "srgb", "--iterations", "150", "--preset", "fast"]
 
@@ -142,29 +138,6 @@ def test_what_does_not_fit_is_refused_in_one_line(merged, survey, tmp_path, capf
     assert len(capfd.readouterr().err.splitlines()) == 5
 
 
-@pytest.mark.parametrize(
-    ("first", "count", "visible", "names"),
-    [
-        ("cuda", 1, None, ["0"]),
-        ("cuda:1", 2, None, ["1", "2"]),
-        ("cuda:0", 2, "3,5", ["3", "5"]),
-        ("cuda:1", 1, "GPU-8f6c, GPU-71aa", ["GPU-71aa"]),
-    ],
-)
-def test_blocks_take_the_gpus_that_the_user_made_visible(monkeypatch, first, count, visible, names):
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    if visible is not None:
-        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    assert jobs.visible_gpus(torch.device(first), count) == names
-
-
-def test_a_job_of_this_machine_sees_its_gpu_alone(monkeypatch, tmp_path):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,GPU-71aa")
-    executors = jobs.local_executors(tmp_path, 3, jobs.visible_gpus(torch.device("cuda"), 2))
-    running = [executor.submit(os.getenv, "CUDA_VISIBLE_DEVICES") for executor in executors]
-    assert [job.result() for job in running] == ["3", "GPU-71aa", "3"]
-
-
 @pytest.mark.parametrize("flag", [("--blocks", "auto"), ("--blocks=auto",)])
 def test_one_training_that_does_for_auto_takes_all_gpus(survey, tmp_path, monkeypatch, flag):
     started = []
@@ -175,41 +148,6 @@ def test_one_training_that_does_for_auto_takes_all_gpus(survey, tmp_path, monkey
     words = ["train", str(survey), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu"]
     assert call(*[*words, *flag]) == 0
     assert started == [(2, words)]
-
-
-def test_slurm_jobs_take_the_parameters(tmp_path):
-    slurm = {"partition": "gpu", "time": "90", "mem": "64GB"}
-    parameters = jobs._slurm_parameters(slurm, gpu=True)
-    assert parameters == {"timeout_min": 90, "gpus_per_node": 1, "slurm_partition": "gpu", "slurm_mem": "64GB"}
-    executor = submitit.AutoExecutor(folder=tmp_path, cluster="debug")  # Checks names and types as for SLURM.
-    executor.update_parameters(name="town", **parameters)
-    assert "gpus_per_node" not in jobs._slurm_parameters(slurm, gpu=False)
-    of_srun = jobs._slurm_parameters({"cpus_per_task": "8"}, gpu=False)
-    assert of_srun["slurm_cpus_per_task"] == 8 and of_srun["slurm_srun_args"] == ["--cpus-per-task=8"]
-    executor.update_parameters(**of_srun)
-
-
-def test_the_number_of_blocks_follows_photos_and_gaussians():
-    config = Config()
-    assert blocks_for(400, 400 * 1e6, config) == 1
-    assert blocks_for(1200, 1200 * 1e6, config) == 4, "30,000 steps are for 400 photos"
-    assert blocks_for(20_000, 20_000 * 20e6, config) == 65
-    assert blocks_for(300, 300 * 100e6, config) == 9, "3 million Gaussians for each"
-    named = override_config(config, {"densification.cap_max": 10**6, "plan.keep": ["densification.cap_max"]})
-    assert blocks_for(300, 300 * 100e6, named) == 1
-
-
-def test_the_estimate_has_the_blocks_of_auto_and_their_gaussians(survey):
-    """A plan may give a single training more Gaussians, which blocks do not get."""
-    plan = make_plan(load_scene(survey), override_config(Config(), {"response.name": "srgb"}), "cpu")
-    dense = override_config(plan.config, {"mcmc.cap_density": 240.0})
-    for photos, blocks in ((400, 1), (1200, 4)):
-        many = replace(plan, config=dense, facts=replace(plan.facts, photos=photos, pixels=photos * 10**6))
-        choices, recommended = estimate(many, Config(), torch.device("cpu"))
-        assert (f"--blocks {blocks}:" in recommended) == (blocks > 1)
-        assert {choice.name.startswith(f"{blocks} blocks") for choice in choices if "block" in choice.name} <= {True}
-    cost = next(choice.cost for choice in choices if choice.name.startswith("4 blocks"))
-    assert cost.disk_bytes == pytest.approx((4 * 1.3 / 4 + 1 / 4) * 940 * 120 * (1200e6) ** 0.5)
 
 
 def test_a_block_that_cannot_be_trained_does_not_end_the_others(tmp_path, survey, divide, jobs_here, capfd):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.evaluation.perceptual import _squeezenet_features, load_lpips
+from sehdr_warp.evaluation.perceptual import load_lpips, squeezenet_features
 
 
 @pytest.fixture(scope="module")
@@ -15,7 +15,7 @@ def made_up(tmp_path_factory):
     """A folder with weights of the right shapes and random values."""
     folder = tmp_path_factory.mktemp("lpips")
     torch.manual_seed(0)
-    torch.save(_squeezenet_features().state_dict(), folder / "squeezenet1_1_features.pth")
+    torch.save(squeezenet_features().state_dict(), folder / "squeezenet1_1_features.pth")
     widths = (64, 128, 256, 384, 384, 512, 512)
     heads = {f"lin{i}.model.1.weight": torch.rand(1, width, 1, 1) for i, width in enumerate(widths)}
     torch.save(heads, folder / "squeeze.pth")

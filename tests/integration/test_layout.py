@@ -6,7 +6,6 @@ TESTS = Path(__file__).resolve().parents[1]
 ROOT = TESTS.parent
 NOT_PACKAGES = {"integration", "fuzz", "trial", "scenes_generator"}
 TOPICS = {
-    "blocks": {"shared_decisions", "slurm"},
     "compat/gsplat": {"against_gsplat", "simple_trainer"},
     "kernels": {"cuda_compilation"},
     "output": {"blender"},
@@ -15,7 +14,6 @@ TOPICS = {
         "bad_input", "confidence", "deterministic", "fields", "nodes", "out_of_memory", "reserved_rows", "resume",
         "units",
     },
-    "viewer": {"proxies"},
 }  # fmt: skip
 """Tests of what several modules of a package do together. Prefer a module's name."""
 

@@ -1,31 +1,14 @@
 """Checkpoints: complete or absent, hashed, newest first."""
 
-import os
-import subprocess
-
 import pytest
 import torch
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.files import _beside
 from sehdr_warp.runs.checkpoint import RENDER_TENSORS, read_checkpoint
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.runs.run_writer import RunWriter
 from tests.make_scenes import edited_json
 
-
-@pytest.fixture
-def folder(tmp_path):
-    return RunWriter(tmp_path)
-
-
-def state(iteration):
-    tensors = {
-        "a.b": torch.arange(6.0).reshape(2, 3) + iteration,
-        "step": torch.tensor(3.0),
-        "rng": torch.arange(4, dtype=torch.uint8),
-    }
-    return tensors, {"iteration": iteration, "order": [2, 0], "seconds": 1.25}
+from .conftest import state
 
 
 def test_round_trip(folder):
@@ -38,13 +21,6 @@ def test_round_trip(folder):
     assert all(torch.equal(read.tensors[name], value) for name, value in tensors.items())
     assert {name: read.values[name] for name in values} == values
     assert sorted(p.name for p in path.iterdir()) == ["checkpoint.json", "state.safetensors"]
-
-
-def test_only_the_newest_are_kept(folder):
-    for iteration in (9, 10, 100):
-        folder.write_checkpoint(*state(iteration), keep=2)
-    assert sorted(p.name for p in folder.checkpoints.iterdir()) == ["iteration_00000010", "iteration_00000100"]
-    assert folder.newest_checkpoint().values["iteration"] == 100
 
 
 def test_a_damaged_newest_falls_back(folder):
@@ -60,22 +36,6 @@ def test_a_damaged_newest_falls_back(folder):
     # Written again, the damaged one is replaced.
     folder.write_checkpoint(*state(2), keep=2)
     assert folder.newest_checkpoint().values["iteration"] == 2
-
-
-def test_what_a_killed_writer_left_is_no_checkpoint(folder):
-    """Nor is what somebody else keeps there; that stays."""
-    with subprocess.Popen(["true"]) as dead:
-        pass
-    left = _beside(folder.checkpoints / "iteration_00000005")
-    left = left.with_name(left.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-"))
-    theirs = [folder.checkpoints / name for name in ("iteration_best", "iteration_00000001", ".iteration_x")]
-    for place in (left, *theirs):
-        place.mkdir(parents=True)
-        (place / "half").write_bytes(b"half")
-    with pytest.raises(InputError, match="iteration_00000001"):
-        folder.newest_checkpoint()
-    folder.write_checkpoint(*state(6), keep=1)
-    assert not left.exists() and all((place / "half").exists() for place in theirs)
 
 
 def test_what_decides_the_picture_is_hashed_with_the_checkpoint(folder):

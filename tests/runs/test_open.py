@@ -179,9 +179,3 @@ def test_the_castle_goes_on_if_its_cameras_are_found_again(tmp_path, castle_phot
     assert not np.array_equal(found, known)
     trainer = create_trainer(scene, run, resume=True, device="cpu")
     np.testing.assert_array_equal([view.camera.world_to_camera for view in trainer.scene.views], known)
-
-
-@pytest.mark.parametrize("name", ["gpu", "mps", "cuda:99"])
-def test_devices_that_torch_cannot_use_are_named(embedded_run, name):
-    with pytest.raises(InputError, match=f"device {name}: (is neither a CPU nor|cannot be used)"):
-        load_run(embedded_run, device=name)

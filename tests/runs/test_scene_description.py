@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.runs.scene_description import describe_scene, in_world_of_run
+from sehdr_warp.runs.run_folder import RunFolder
+from sehdr_warp.runs.scene_description import changed_photos, describe_scene, in_world_of_run, photo_signature
 from sehdr_warp.scene.lens import Lens
 
 from ..found_cameras import TURN, in_other_world
@@ -53,3 +54,44 @@ def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_th
         changed = replace(views[0], camera=replace(first, **change))
         with pytest.raises(InputError, match="of 5 photos have other cameras than run was trained with: v_0"):
             in_world_of_run(replace(scene, views=(changed, *views[1:])), cameras, 4.0, "run", "photos")
+
+
+def test_photos_that_were_changed_are_noticed(run):
+    scene = toy_scene(2, 8)
+    folder = RunFolder(run)
+    folder.check_same_scene(scene)
+    changed = [view.codes.copy() for view in scene.views]
+    changed[0][:3, :3] = 255 - changed[0][:3, :3]
+    views = tuple(replace(view, codes=codes) for view, codes in zip(scene.views, changed, strict=True))
+    with pytest.raises(
+        InputError, match=f"photos or masks were changed since the training began: {scene.views[0].name};"
+    ):
+        folder.check_same_scene(replace(scene, views=views))
+
+
+@pytest.mark.parametrize("part, change", [("splits", {"split": "test"}), ("exposure times", {"exposure_time": 9.0})])
+def test_what_differs_from_the_scene_of_a_run_is_named(run, part, change):
+    scene = toy_scene(2, 8)
+    changed = replace(scene, views=(replace(scene.views[0], **change), *scene.views[1:]))
+    with pytest.raises(InputError, match=f"its {part} differ.* if another version decided"):
+        RunFolder(run).check_same_scene(changed)
+
+
+def test_masks_that_were_changed_are_noticed(run):
+    scene = toy_scene(2, 8)
+    mask = np.ones(scene.views[0].codes.shape[:2], np.float32)
+    masked = replace(scene, views=tuple(replace(view, mask=mask) for view in scene.views))
+    with pytest.raises(InputError, match="photos or masks were changed"):
+        RunFolder(run).check_same_scene(masked)
+    ones, half = (photo_signature(scene.views[0].codes, mask * part) for part in (1, 0.5))
+    assert changed_photos({"a": ones}, {"a": half}) == ["a"] and not changed_photos({"a": ones}, {"a": ones})
+
+
+def test_a_signature_forgives_rounding_alone():
+    rng = np.random.default_rng(3)
+    for shape, kind in (((31, 45, 3), np.uint8), ((3, 2, 3), np.uint8), ((300, 20, 3), np.uint16)):
+        codes = rng.integers(0, np.iinfo(kind).max, shape).astype(kind)
+        other = np.clip(codes.astype(int) + rng.integers(-1, 2, shape), 0, np.iinfo(kind).max).astype(kind)
+        assert not changed_photos({"a": photo_signature(codes)}, {"a": photo_signature(other)})
+        assert changed_photos({"a": photo_signature(codes)}, {"a": photo_signature(codes[::-1])}) == ["a"]
+    assert changed_photos({"a": "no digits", "b": "00"}, {"a": "00", "c": "00"}) == ["a"]

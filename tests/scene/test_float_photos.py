@@ -10,7 +10,8 @@ from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.scene import load_scene
 from sehdr_warp.training.plan import make_plan
 from tests.make_scenes import write_colmap
-from tests.scene.raw.dng_files import picture, posed
+
+from .raw.dng_files import picture, posed
 
 
 def light_of(view, scene):

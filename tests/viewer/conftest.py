@@ -31,12 +31,13 @@ def serve(tmp_path):
     """serve(**options) starts a server of two runs with photos, and returns it."""
     servers = ExitStack()
 
-    def start(count=1, **options):
+    def start(count=1, photos=None, **options):
         run, scene = make(tmp_path)
         run.field = SimpleNamespace(render_mean=lambda camera, values: torch.full((camera.height, camera.width), 0.25))
         runs = [run, AnalyticRun()][:count]
         scenes = [ViewerScene(each, f"run {i}", torch.ones(1) if i == 0 else None) for i, each in enumerate(runs)]
-        viewer = Viewer(scenes, lambda index: {view.name: view for view in scene.views}, **options)
+        photos = photos or (lambda index: {view.name: view for view in scene.views})
+        viewer = Viewer(scenes, photos, **options)
         return servers.enter_context(serving(viewer, 18080))
 
     with servers:

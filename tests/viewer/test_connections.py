@@ -7,11 +7,8 @@ import time
 
 import pytest
 
-from sehdr_warp import load_run
 from sehdr_warp.viewer import connections
-from sehdr_warp.viewer.clients import ClientRun
 from sehdr_warp.viewer.server import MOST_SAVED, Server
-from sehdr_warp.viewer.viewer_scene import ViewerScene
 
 from ..output.helpers import AnalyticRun, camera
 from .test_server import ask, frame
@@ -45,7 +42,7 @@ def test_clients_that_never_read_make_room_for_others(serve, monkeypatch):
     def watch():
         nonlocal largest
         while not watched.wait(0.005):
-            largest = max(largest, sum(each.reserved_bytes for each in list(server.connections._open.values())))
+            largest = max(largest, sum(each.reserved_bytes for each in list(server.connections.by_socket.values())))
 
     watcher = threading.Thread(target=watch)
     watcher.start()
@@ -54,7 +51,7 @@ def test_clients_that_never_read_make_room_for_others(serve, monkeypatch):
         started = time.monotonic()
         frame(server, camera(64, 48))
         assert time.monotonic() - started < 10
-    until(lambda: all(not each.answering for each in list(server.connections._open.values())), 60)
+    until(lambda: all(not each.answering for each in list(server.connections.by_socket.values())), 60)
     watched.set()
     watcher.join()
     assert largest <= 50 << 20
@@ -75,7 +72,7 @@ def test_clients_that_never_end_a_request_make_room_for_others(serve, monkeypatc
     time.sleep(0.2)
     started = time.monotonic()
     assert ask(server, "/scene")[0] == 200 and time.monotonic() - started < 5
-    assert len(server.connections._open) <= 5
+    assert len(server.connections.by_socket) <= 5
     for client in begun:
         client.close()
 
@@ -106,9 +103,8 @@ def test_a_save_ends_when_its_client_leaves(serve, kind):
     until(lambda: run.renders > 1)
     assert ask(server, "/save", {"cameras": [small], "kind": "exr"})[0] == 503
     client.close()
-    until(lambda: not server.viewer._save_lock.locked())
+    until(lambda: ask(server, "/save", {"cameras": [small], "kind": "exr"})[0] == 200)
     assert run.renders < 1000
-    assert ask(server, "/save", {"cameras": [small], "kind": "exr"})[0] == 200
 
 
 def test_the_end_of_the_server_ends_a_save(serve):
@@ -120,7 +116,7 @@ def test_the_end_of_the_server_ends_a_save(serve):
     server.shutdown()
     started = time.monotonic()
     server.server_close()
-    assert time.monotonic() - started < 10 and not server.viewer._save_lock.locked() and run.renders < 1000
+    assert time.monotonic() - started < 10 and run.renders < 1000
     client.close()
 
 
@@ -128,39 +124,3 @@ def test_a_save_that_would_fill_the_disk_is_refused(serve):
     large = camera(4096, 2304).to_dict()
     status, _, content = ask(serve(), "/save", {"cameras": [large] * 60, "kind": "exr"})
     assert status == 413 and str(MOST_SAVED).encode() in content
-
-
-@pytest.mark.parametrize("host", ["127.0.0.2", "localhost", "127.0.0.1"])
-def test_a_server_for_this_machine_alone_has_no_other_names(serve, host):
-    try:
-        server = Server(serve().viewer, host, 0)
-    except OSError:
-        pytest.skip(f"{host} is no address here")
-    port = server.server_address[1]
-    for name in (host, f"{host}:{port}", f"localhost:{port}", "[::1]:1"):
-        assert server.allowed(name, None)
-    for name in (
-        "",
-        "evil.example",
-        f"evil.example:{port}",
-        "127.0.0.2.evil.example",
-        f"localhost.evil:{port}",
-        "[::2]",
-    ):
-        assert not server.allowed(name, None)
-    assert not server.allowed(f"{host}:{port}", "http://evil.example")
-    server.server_close()
-
-
-def test_a_small_save_that_is_averaged_waits_as_a_picture_of_its_finer_pixels(embedded_run):
-    run, sizes = load_run(embedded_run), []
-
-    def on_renderer(client, make, pixels):
-        sizes.append(pixels)
-        return make()
-
-    client_run, photo = ClientRun(on_renderer, ViewerScene(run, "run"), None), run.cameras[0].camera
-    small = photo.resized(photo.width // 2, photo.height // 2)
-    for supersample in (True, False):
-        assert client_run.render(small, supersample=supersample).hdr.shape == (small.height, small.width, 3)
-    assert sizes == [4 * small.width * small.height, small.width * small.height]

@@ -130,7 +130,7 @@ def test_pictures_take_their_share_and_no_more(watched):
         looking.start()
     started = time.perf_counter()
     assert sum(1 for _ in live.attend()) == 60
-    share = live._spent / (time.perf_counter() - started)
+    share = live.picture_seconds / (time.perf_counter() - started)
     assert (0.02 < share < 1.6 * SHARE) if watched else share == 0
     if watched:
         looking.join(10)

@@ -3,13 +3,8 @@
 import http.client
 import io
 import json
-import os
 import re
-import shutil
-import signal
 import socket
-import subprocess
-import sys
 import threading
 import zipfile
 
@@ -17,16 +12,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.world_transform import WorldTransform
-from sehdr_warp.runs.open import open_scene
 from sehdr_warp.scene import load_cameras, look_at
-from sehdr_warp.training.train import train
-from sehdr_warp.viewer.server import MOST_BODY, MOST_VIEWS
-from sehdr_warp.viewer.watching import Watch
+from sehdr_warp.viewer.server import MOST_BODY, MOST_VIEWS, Server, Viewer
 
-from ..output.helpers import camera, read_exr
-from ..training.toy import toy_scene
+from ..output.helpers import camera, make, read_exr
 
 
 def ask(server, path, body=None, method=None, **headers):
@@ -88,7 +80,7 @@ def test_the_page_its_facts_and_photos(serve):
     assert [run["name"] for run in facts["runs"]] == ["run 0", "run 1"] and not facts["training"]
     assert [view["name"] for view in facts["runs"][0]["views"]] == ["v_0", "v_1", "v_2"]
     picture = np.asarray(Image.open(io.BytesIO(ask(server, "/photo/0/1")[2])))
-    view = server.viewer._photos(0)["v_1"]
+    view = make(None)[1].views[1]
     np.testing.assert_allclose(picture / 255, view.image, atol=0.5 / 255 + 1e-6)
 
 
@@ -108,14 +100,18 @@ def test_what_is_saved_is_what_render_writes(serve, tmp_path):
     path = json.loads(ask(server, "/path", {"cameras": [view.to_dict(), other], "count": 9})[2])
     assert len(path["cameras"]) == 9 and path["cameras"][0]["name"] == "view_000"
     if pytest.importorskip("av"):
-        progress_lines, tell = [], server.viewer._tell
-        server.viewer._tell = lambda line: (tell(line), progress_lines.append(ask(server, "/saving")[2].decode()))
+        run = server.viewer.runs[0].run
+        progress_lines, render = [], run.render
+
+        def watched(*arguments, **options):
+            progress_lines.append(ask(server, "/saving")[2].decode())
+            return render(*arguments, **options)
+
+        run.render = watched
         film = ask(server, "/save", {"cameras": [view.to_dict(), other], "kind": "film", "count": 3, "stops": -1})
         assert film[:2] == (200, "video/mp4") and b"ftyp" in film[2][:16]
-        assert [line.partition(", ")[0] for line in progress_lines] == [
-            "film.mp4: frames: 1 of 3",
-            "film.mp4: frames: 2 of 3",
-        ]
+        lines = [line.partition(", ")[0] for line in progress_lines]
+        assert lines == ["", "film.mp4: frames: 1 of 3", "film.mp4: frames: 2 of 3"]
         assert ask(server, "/saving")[2] == b""
 
 
@@ -207,51 +203,103 @@ def test_a_taken_port_leads_to_the_next(serve, logged):
 
 
 def test_photos_that_are_gone_are_told(serve):
-    server = serve()
-
     def gone(index):
-        from sehdr_warp.errors import InputError
-
         raise InputError("photos", "are no longer here", "say where")
 
-    server.viewer._photos = gone
+    server = serve(photos=gone)
     assert ask(server, "/photo/0/0")[::2] == (409, b"photos: are no longer here; say where")
 
 
-def test_what_a_training_writes_meanwhile_is_shown(tmp_path, logged):
-    options = {"plan.enabled": False, "schedule.iterations": 2}
-    paths = [tmp_path / "run", tmp_path / "other"]
-    for path in paths:
-        train(toy_scene(), path, options, device="cpu")
-    watch = Watch(paths, lambda path: open_scene(path, "cpu"))
-    watch.look()
-    scene_shown = watch.scenes[0]
-    assert [run.version for run in watch.scenes] == [0, 0] and scene_shown.facts()["iterations"] == 2
-    train(toy_scene(), paths[0], options | {"schedule.iterations": 4}, device="cpu", overwrite=True)
-    watch.look()
-    assert [run.version for run in watch.scenes] == [1, 0] and scene_shown.facts()["iterations"] == 4
-    assert scene_shown.clipped is not None
-    for damage in (lambda: (paths[0] / "scene.json").unlink(), lambda: shutil.rmtree(paths[0])):
-        damage()
-        for file in paths[0].glob("checkpoints/*/checkpoint.json"):
-            os.utime(file, (1, 1))
-        watch.look()
-        assert "keeps what it has read" in logged[-1] and scene_shown.version == 1
-    assert [*scene_shown.frame_parts(camera(8, 8))][-1].nbytes == 8 * 8 * 5 * 2
+PUBLIC = "splats.example.org"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
-def test_the_command_serves_and_ends_cleanly(tmp_path):
-    train(toy_scene(), tmp_path / "run", {"schedule.iterations": 5, "plan.enabled": False}, device="cpu")
-    # Tests that run in a shell's background have SIGINT ignored, and children inherit that.
-    code = "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    code += "runpy.run_module('sehdr_warp', run_name='__main__', alter_sys=True)"
-    command = [sys.executable, "-c", code, "view", str(tmp_path / "run"), "--port", "18300", "--device", "cpu"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
-    url = process.stdout.readline().split()[0]
-    connection = http.client.HTTPConnection(url.removeprefix("http://").strip("/"), timeout=30)
-    connection.request("GET", "/scene")
-    assert json.loads(connection.getresponse().read())["runs"][0]["iterations"] == 5
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
-    assert process.returncode == 0 and not output and "Traceback" not in errors and "ended" in errors
+@pytest.fixture
+def statuses(serve, monkeypatch):
+    """Statuses of /scene for headers, by a server with or without a proxy's origin."""
+
+    def of(origins=(), host="127.0.0.1"):
+        server = serve()
+        server.origins, server.host = origins, host
+        port = server.server_address[1]
+        cases = {
+            "tunnel": {"Host": "localhost:8080", "Origin": "http://localhost:8080"},
+            "tls tunnel": {"Host": "localhost:8443", "Origin": "https://localhost:8443"},
+            "proxy": {"Host": PUBLIC, "Origin": f"https://{PUBLIC}"},
+            "proxy that rewrites the host": {"Host": f"127.0.0.1:{port}", "Origin": f"https://{PUBLIC}"},
+            "another site": {"Host": f"127.0.0.1:{port}", "Origin": "http://evil.example"},
+            "another site by a name of its own": {"Host": "evil.example", "Origin": "http://evil.example"},
+        }
+        return {name: ask(server, "/scene", **headers)[0] for name, headers in cases.items()}
+
+    return of
+
+
+def test_a_local_viewer_answers_its_own_names(statuses):
+    assert list(statuses().values()) == [200, 200, 403, 403, 403, 403]
+
+
+def test_origin_lets_a_proxy_in_and_nobody_else(statuses):
+    assert list(statuses(origins=(f"https://{PUBLIC}",)).values()) == [200, 200, 200, 200, 403, 403]
+
+
+def test_a_viewer_of_the_network_answers_https_of_the_same_host(statuses):
+    codes = statuses(host="0.0.0.0")
+    assert codes["proxy"] == 200 and codes["another site"] == 403 and codes["proxy that rewrites the host"] == 403
+
+
+def test_queries_are_ignored_and_addresses_are_relative(serve):
+    server = serve()
+    assert ask(server, "/?vscodeBrowserReqId=1")[0] == 200
+    assert ask(server, "/scene?x=/../secret")[0] == 200
+    page = ask(server, "/")[2].decode()
+    script = ask(server, "/viewer.js")[2].decode()
+    assert 'src="/' not in page and 'href="/' not in page and 'ask("/' not in script and "ask(`/" not in script
+
+
+@pytest.mark.parametrize("prefix", ["/proxy/absolute/7007", "/user/me"])
+def test_a_prefix_that_a_proxy_leaves_does_not_matter(serve, prefix):
+    """jupyter-server-proxy's /proxy/absolute/PORT/ and nginx without a trailing slash; visdom pull request 978."""
+    server = serve()
+    for path in ("/", "/viewer.js", "/scene", "/photo/0/1"):
+        assert ask(server, prefix + path)[0::2] == ask(server, path)[0::2]
+    assert ask(server, f"{prefix}/nothing")[0] == 404
+
+
+def test_head_is_a_get_without_content(serve):
+    status, kind, content = ask(serve(), "/", method="HEAD")
+    assert (status, kind, content) == (200, "text/html", b"")
+    assert ask(serve(), "/nothing", method="HEAD")[0] == 404
+
+
+def test_a_refusal_names_the_way_out(serve):
+    status, _, content = ask(serve(), "/scene", Origin="https://evil.example")
+    assert status == 403 and b"--origin https://ITS.NAME" in content
+
+
+def test_previews_may_frame_the_page_and_sites_may_not():
+    server = Server(Viewer([]), port=18300, origins=("https://a.example",))
+    server.server_close()
+    ancestors = server.security_policy.partition("frame-ancestors")[2].split()
+    assert ancestors == ["'self'", "vscode-webview:", "https://a.example"]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "localhost", "127.0.0.1"])
+def test_a_server_for_this_machine_alone_has_no_other_names(serve, host):
+    try:
+        server = Server(serve().viewer, host, 0)
+    except OSError:
+        pytest.skip(f"{host} is no address here")
+    port = server.server_address[1]
+    for name in (host, f"{host}:{port}", f"localhost:{port}", "[::1]:1"):
+        assert server.allowed(name, None)
+    for name in (
+        "",
+        "evil.example",
+        f"evil.example:{port}",
+        "127.0.0.2.evil.example",
+        f"localhost.evil:{port}",
+        "[::2]",
+    ):
+        assert not server.allowed(name, None)
+    assert not server.allowed(f"{host}:{port}", "http://evil.example")
+    server.server_close()

@@ -17,11 +17,11 @@ from sehdr_warp.scene.raw.decode import color_matrix, linear_codes, read_header,
 from sehdr_warp.scene.raw.dng import read_dng
 from sehdr_warp.scene.readers.bare_photos import find_photos
 from sehdr_warp.synth.expose import SensorNoise, noisy
-from tests.scene.raw.dng_files import picture, posed
 from tests.splats.samples import gaussians
 
 from ...make_scenes import edited_json
 from ...output.helpers import camera
+from ..raw.dng_files import picture, posed
 from .dng_files import TO_CAMERA, write_dng
 
 BALANCE = np.array([0.5, 1.0, 0.7])

@@ -30,7 +30,8 @@ from sehdr_warp.scene.sfm.reconstruction import (
     write_photos,
 )
 from tests.make_scenes import load
-from tests.scene.raw.dng_files import picture
+
+from ..raw.dng_files import picture
 
 # Of messages and of estimates of time
 WITHOUT_EFFECT = {"MOST_ERROR", "_SURE", "_MOST_TURNED", "_NEAR", "_PAIR_COST", "_PLACE_COST"}

@@ -11,8 +11,8 @@ from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.video.color import VideoColor, codes_in_rec709
 from sehdr_warp.scene.video.decode import codes, decode, open_clip
-from tests.scene.video.clips import still
 
+from ..video.clips import still
 from .clips import pan, write_clip
 
 pytest.importorskip("av")

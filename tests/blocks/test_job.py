@@ -1,4 +1,4 @@
-"""Decisions that a block takes from the whole set: base time and the compensation of its photos."""
+"""One block: decisions of the whole set, and machines with other versions or photos."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,13 @@ import torch
 
 from benchmarks.survey import write_survey
 from sehdr_warp.blocks.block_plan import BlockPlan, make_block_plan
-from sehdr_warp.blocks.job import load_block_scene
+from sehdr_warp.blocks.job import folder_of, load_block_scene, train_block
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.run_folder import RunFolder
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.exposure.compensation import ExposureCompensation
 from sehdr_warp.training.compensation import SharedDecisions
+from sehdr_warp.training.launch import installed_versions
 from sehdr_warp.training.train import create_trainer
 
 from ..found_cameras import TURN, find_cameras, in_other_world, write_bare_photos
@@ -54,3 +55,24 @@ def test_blocks_of_bare_photos_stay_in_the_world_of_the_set(tmp_path, monkeypatc
         np.testing.assert_allclose(after.points, scene.points, atol=1e-9)
         for view, other in zip(scene.views, after.views, strict=True):
             np.testing.assert_array_equal(view.camera.world_to_camera, other.camera.world_to_camera)
+
+
+def test_a_machine_with_other_versions_trains_nothing(divided):
+    folder, plan = divided
+    result = train_block(folder / "run", 0, "cpu", "sehdr-warp 0.1")
+    assert f"it has {installed_versions()}, and the command was started with sehdr-warp 0.1" in result.error
+    assert not folder_of(folder / "run", plan, 0).exists()
+
+
+def test_a_machine_with_other_photos_trains_nothing(divided):
+    folder, plan = divided
+    photo = folder / "town" / "images" / f"{plan.blocks[0].views[1]}.png"
+    before = photo.read_bytes()
+    photo.write_bytes(before + b"more")
+    try:
+        result = train_block(folder / "run", 0, "cpu", installed_versions())
+    finally:
+        photo.write_bytes(before)
+    sizes = f"has {len(before) + 4} bytes, and had {len(before)} when the set was divided"
+    assert f"{photo.stem} {sizes}; copy the same set to all nodes" in result.error
+    assert not folder_of(folder / "run", plan, 0).exists()
