@@ -17,10 +17,7 @@ from sehdr_warp.runs.field import assemble_field
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.normalization import normalization_of
 from sehdr_warp.splats.arrays import HARMONIC_0
-from sehdr_warp.training.initialization import (
-    make_field,
-    make_matcher,
-)
+from sehdr_warp.training.initialization import make_field, make_matcher
 from sehdr_warp.training.seeding import brighten_clipped, expected_excess, make_seeds
 from sehdr_warp.training.train import create_trainer
 from sehdr_warp.training.training_views import ViewDataset
