@@ -8,8 +8,6 @@ import sys
 
 import pytest
 
-from sehdr_warp.training.process_settings import interruptible
-
 
 @pytest.mark.parametrize(
     "line, code, message",
@@ -64,35 +62,6 @@ sehdr_warp.load_scene, sehdr_warp.train
 assert before == (gc.get_threshold(), len(gc.callbacks), gc.get_freeze_count())
 """
     subprocess.run([sys.executable, "-c", program], check=True)
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_the_first_signal_waits_for_the_end_of_the_block_and_the_second_does_not(number):
-    class Ended(BaseException):
-        pass
-
-    def end(*_):
-        raise Ended
-
-    before, reached = signal.signal(number, end), []
-    try:
-        with pytest.raises(Ended), interruptible() as interrupted:
-            signal.raise_signal(number)
-            reached.append(interrupted.is_set())
-        with pytest.raises(Ended), interruptible():
-            signal.raise_signal(number)
-            signal.raise_signal(number)
-            reached.append("never")
-        with pytest.raises(ValueError), interruptible():
-            signal.raise_signal(number)
-            raise ValueError
-        signal.signal(number, signal.SIG_IGN)
-        with interruptible() as interrupted:
-            signal.raise_signal(number)
-            reached.append(interrupted.is_set())
-    finally:
-        signal.signal(number, before)
-    assert reached == [True, False]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
