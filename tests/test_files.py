@@ -158,8 +158,6 @@ def test_json_has_no_nan(tmp_path):
 
 
 HEAD = "import os, signal; from pathlib import Path; from sehdr_warp import files\n"
-
-
 DIE = "def die(*_, **__): os.kill(os.getpid(), signal.SIGKILL)\n"
 
 

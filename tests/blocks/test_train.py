@@ -19,11 +19,7 @@ from sehdr_warp.splats import read_gaussians
 from ..refusals import call, refused
 
 submitit = pytest.importorskip("submitit")
-
-
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
-
-
 FLAGS = ["--device", "cpu", "--response", "srgb", "--iterations", "150", "--preset", "fast"]
 
 

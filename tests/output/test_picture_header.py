@@ -10,11 +10,7 @@ from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.lighting.environment_map import write_environment_map
 from sehdr_warp.output.render_views import render_views
-from sehdr_warp.output.world_transform import (
-    WorldTransform,
-    photos_to_scene,
-    world_transform,
-)
+from sehdr_warp.output.world_transform import WorldTransform, photos_to_scene, world_transform
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera
 from tests.splats.samples import gaussians

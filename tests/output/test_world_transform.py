@@ -5,12 +5,7 @@ from scipy.spatial.transform import Rotation
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.export.gaussians import export
-from sehdr_warp.output.world_transform import (
-    WorldTransform,
-    scene_up,
-    world_transform,
-    write_orientation,
-)
+from sehdr_warp.output.world_transform import WorldTransform, scene_up, world_transform, write_orientation
 from sehdr_warp.runs.run import Splats, load_splats
 from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.gravity import UpDirection

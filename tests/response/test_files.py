@@ -102,8 +102,6 @@ BAD_TABLES = {
     "falling": "0 1\n0.5 0.5\n1 0\n",
     "binary": "\x00\x01\x02\n",
 }
-
-
 BAD_JSON = (
     "{",
     "[1, 2]",
@@ -113,8 +111,6 @@ BAD_JSON = (
     '{"kind": ["table"]}',
     "[" * 100000,
 )
-
-
 BAD_FILES = [("csv", text) for text in BAD_TABLES.values()] + [("json", text) for text in BAD_JSON]
 
 

@@ -9,11 +9,7 @@ import pytest
 import sehdr_warp
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.runs.config import Config
-from sehdr_warp.runs.config_files import (
-    config_fields,
-    load_config,
-    preset_names,
-)
+from sehdr_warp.runs.config_files import config_fields, load_config, preset_names
 from sehdr_warp.training.optimizer import means_rate
 
 PACKAGE = Path(sehdr_warp.__file__).parent

@@ -16,8 +16,6 @@ from tests.training.toy import toy_scene
 from .conftest import read_all
 
 REGIONS = {"regions": 1, "photos": 1, "worst": [REGION]}
-
-
 WRONG_SUMMARIES = [
     {"device": [1]}, {"device": 5}, {"device": None}, {"device": "x" * 5000}, {"iteration": "1"}, {"iteration": -1},
     {"iteration": 1.5}, {"train_seconds": "soon"}, {"train_seconds": -1.0}, {"gaussians": True},

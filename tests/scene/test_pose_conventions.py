@@ -13,8 +13,6 @@ from sehdr_warp.scene.load import parse_dataset
 from sehdr_warp.scene.shared_pixels import candidate_pairs, shared_pixels
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
 LARGER = 2  # Times the embedded photos, in which few features are found
 
 

@@ -7,13 +7,7 @@ import sys
 import numpy as np
 from PIL import Image
 
-from tests.make_scenes import (
-    edit_transforms,
-    load,
-    pattern,
-    write_blender,
-    write_colmap,
-)
+from tests.make_scenes import edit_transforms, load, pattern, write_blender, write_colmap
 
 
 def test_photos_are_averaged_side_by_side(tmp_path):

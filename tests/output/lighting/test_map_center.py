@@ -7,9 +7,7 @@ import pytest
 
 from sehdr_warp.errors import SehdrError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.output.lighting.environment_map import (
-    write_environment_map,
-)
+from sehdr_warp.output.lighting.environment_map import write_environment_map
 from sehdr_warp.output.lighting.map_center import map_center
 from sehdr_warp.runs.run import Splats
 

@@ -22,14 +22,8 @@ from ...viewer.browser import browser, page_of
 from ..helpers import LIGHTS, AnalyticRun, make, validate
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
-
-
 PLAN = [{"name": "brackets", "choice": "plain <scaling>", "reason": "0.0% of the pixels clip"}]
-
-
 FIGURES = {"psnr": 31.4, "ssim": 0.9}, {"psnr_mu": 28.2, "ssim_mu": None}
-
-
 EVALUATION = {
     "views": [{"name": "v_1", "ldr": FIGURES[0], "protocol": {"gt-max": FIGURES[1]}}],
     "ldr": FIGURES[0],

@@ -20,8 +20,6 @@ from tests.make_scenes import load, pattern, png_of, write_colmap
 SPACES = {"sRGB": ("sRGB", None), "Display P3": ("Display P3", None), "Adobe RGB": ("Adobe RGB (1998)", 563 / 256),
           "ProPhoto": ("ProPhoto RGB", 1.8), "Rec.2020": ("ITU-R BT.2020", 2.4), "ACEScg": ("ACEScg", 2.2),
           "ACES AP0": ("ACES2065-1", 2.2)}  # fmt: skip
-
-
 PATCHES = np.array([[230, 60, 40], [40, 200, 60], [30, 60, 220], [128, 128, 128], [250, 240, 10], [3, 7, 20]])
 
 

@@ -65,14 +65,7 @@ def test_any_steps_between_the_times_make_a_stack(tmp_path, times):
         load_scene(write_photos(tmp_path / "photos", times))
 
 
-@pytest.mark.parametrize(
-    ("times", "shift"),
-    [
-        ((0.125, 1.0, 8.0), 12),
-        ((1.0, 1.2, 1.4), 0),
-        ((None, None, None), 0),
-    ],
-)
+@pytest.mark.parametrize(("times", "shift"), [((0.125, 1.0, 8.0), 12), ((1.0, 1.2, 1.4), 0), ((None, None, None), 0)])
 def test_other_photos_are_matched(tmp_path, times, shift):
     with pytest.raises(Matched):
         load_scene(write_photos(tmp_path / "photos", times, shift))

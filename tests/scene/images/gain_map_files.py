@@ -138,8 +138,6 @@ def write_heif_pair(
 
 
 HEIGHT, WIDTH = 96, 128
-
-
 STOPS = 2.5
 
 

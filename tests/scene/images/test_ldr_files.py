@@ -16,8 +16,6 @@ from sehdr_warp.scene.photos import photo_sizes
 from tests.make_scenes import png_of
 
 cv2 = pytest.importorskip("cv2")
-
-
 RNG = np.random.default_rng(1)
 
 
@@ -64,8 +62,6 @@ def test_orientation_is_pillows(tmp_path, orientation):
 
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n"
-
-
 RGB = Image.fromarray(RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8))
 
 

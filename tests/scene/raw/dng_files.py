@@ -13,11 +13,7 @@ from sehdr_warp.scene.raw.decode import read_raw
 from tests.output.helpers import camera
 
 TO_CAMERA = np.array([[0.9, -0.2, -0.1], [-0.4, 1.2, 0.2], [-0.1, 0.2, 0.6]])  # XYZ to the sensor's colors
-
-
 BAYER = np.array([[0, 1], [1, 2]])
-
-
 Tag = tuple[int, int, bytes]
 
 
@@ -132,14 +128,8 @@ def jpeg_tiles(codes, size):
 
 
 TRUTH = np.array([0.1, 0.3, 0.2])
-
-
 HEIGHT, WIDTH = 96, 128
-
-
 EVEN = np.broadcast_to(TRUTH, (HEIGHT, WIDTH, 3))
-
-
 Y, X = np.mgrid[:HEIGHT, :WIDTH]
 
 

@@ -5,14 +5,9 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_cameras, look_at
-from tests.make_scenes import (
-    load,
-    write_blender,
-)
+from tests.make_scenes import load, write_blender
 
 POSE = look_at((1.0, 2.0, 3.0), (0.0, 0.5, 0.0))
-
-
 CAMERA = {"width": 8, "height": 8, "fx": 9, "fy": 9, "cx": 4, "cy": 4, "world_to_camera": POSE.tolist()}
 
 

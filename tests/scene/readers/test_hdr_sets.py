@@ -10,15 +10,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.dataparser import reinhard_gamma
 from sehdr_warp.scene.load import parse_dataset
-from tests.make_scenes import (
-    arc_poses,
-    load,
-    room_views,
-    write_blender,
-    write_colmap,
-    write_llff,
-    write_room,
-)
+from tests.make_scenes import arc_poses, load, room_views, write_blender, write_colmap, write_llff, write_room
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError
-from tests.make_scenes import (
-    load,
-    pattern,
-    write_colmap,
-    write_llff,
-)
+from tests.make_scenes import load, pattern, write_colmap, write_llff
 
 
 def test_llffs_axes_size_and_focal_length(tmp_path):

@@ -9,11 +9,7 @@ from PIL import Image
 
 from sehdr_warp.scene.readers.bare_photos import find_photos
 from sehdr_warp.scene.unused_files import unused_notes
-from tests.make_scenes import (
-    load,
-    pattern,
-    write_blender,
-)
+from tests.make_scenes import load, pattern, write_blender
 
 from .test_bare_photos import photos
 

@@ -7,12 +7,7 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.readers.transforms import read_transforms
-from tests.make_scenes import (
-    edit_transforms,
-    edited_json,
-    load,
-    write_blender,
-)
+from tests.make_scenes import edit_transforms, edited_json, load, write_blender
 
 
 @pytest.mark.parametrize(

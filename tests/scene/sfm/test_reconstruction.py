@@ -35,8 +35,6 @@ from ..raw.dng_files import picture
 
 # Of messages and of estimates of time
 WITHOUT_EFFECT = {"MOST_ERROR", "_SURE", "_MOST_TURNED", "_NEAR", "_PAIR_COST", "_PLACE_COST"}
-
-
 CONSTANTS = {
     name
     for module in (pairs, sfm)
