@@ -37,6 +37,13 @@ def arc_poses(count: int) -> list[np.ndarray]:
     return [look_at((4 * np.sin(a), -4 * np.cos(a), 0.5)) for a in angles]
 
 
+def write_frames(folder: Path, names: list[str], size: tuple[int, int]) -> None:
+    """A transforms.json of photos of one size [W, H] that all were taken at one place."""
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in names]
+    values = {"w": size[0], "h": size[1], "fl_x": 100, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(values))
+
+
 def pattern(width: int, height: int, seed: int = 0) -> np.ndarray:
     """[H, W, 3] uint8: smooth noise that uses the full range."""
     noise = np.random.default_rng(seed).random((height // 4 + 2, width // 4 + 2, 3))

@@ -1,5 +1,6 @@
 """Places of tests: in folders named after the packages, named after the modules that they test."""
 
+from fnmatch import fnmatch
 from pathlib import Path
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -16,6 +17,24 @@ TOPICS = {
     },
 }  # fmt: skip
 """Tests of what several modules of a package do together. Prefer a module's name."""
+ELSEWHERE = {
+    "with their kernels, in tests/kernels": [
+        "rasterizer/absolute_gradient", "rasterizer/blending*", "rasterizer/gradients", "rasterizer/losses/*",
+        "rasterizer/ops/*",
+    ],
+    "with what calls them, in other tests of their folder": [
+        "blocks/seams", "compat/gsplat/parameter_rows", "compat/gsplat/relocation", "compat/gsplat/strategy/*",
+        "model/color_models", "prior/network", "rasterizer/caller_lists", "rasterizer/cuda_graphs/render_graph",
+        "rasterizer/warp_launch/loading", "rasterizer/warp_launch/packing",
+    ],
+    "on the command line": ["evaluation/commands", "runs/commands", "scene/commands", "training/commands"],
+    "by being part of tests": ["check/*", "rasterizer/reference"],
+    "not alone: a few lines, names or types": [
+        "caches", "model/renders", "rasterizer/render_options", "response/names", "runs/field", "scene/images/xmp",
+        "training/training_progress",
+    ],
+}  # fmt: skip
+"""Modules without a test of their name, by how they are tested."""
 
 
 def home(package: str) -> Path:
@@ -32,3 +51,17 @@ def test_a_test_has_the_name_of_its_module():
         folder = home("/".join(package))
         remedy = f"name it after a module, move it to tests/integration, or add {name!r} to TOPICS here"
         assert (folder / f"{name}.py").is_file() or (folder / name).is_dir(), f"{folder} has no {name}.py: {remedy}"
+
+
+def test_a_module_has_a_test_of_its_name_or_is_named_here():
+    files = (path.relative_to(ROOT / "sehdr_warp") for path in (ROOT / "sehdr_warp").rglob("[!_]*.py"))
+    alone = {
+        file.with_suffix("").as_posix()
+        for file in files
+        if file.parts[0] != "kernels" and not (TESTS / file.parent / f"test_{file.name}").is_file()
+    }
+    patterns = [pattern for group in ELSEWHERE.values() for pattern in group]
+    unnamed = [module for module in sorted(alone) if not any(fnmatch(module, pattern) for pattern in patterns)]
+    assert not unnamed, f"{unnamed}: write tests/PACKAGE/test_MODULE.py, or say in ELSEWHERE where it is tested"
+    tested = [pattern for pattern in patterns if not any(fnmatch(module, pattern) for module in alone)]
+    assert not tested, f"{tested} are gone or have tests of their own: take them out of ELSEWHERE"

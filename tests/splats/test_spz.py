@@ -92,21 +92,14 @@ def test_sizes_that_spz_cannot_hold_are_warned_of(tmp_path, caplog):
     assert "a.spz: 92 % of the Gaussians are beyond SPZ's sizes" in caplog.text
 
 
-def test_extensions_of_spz_are_named(tmp_path, caplog):
-    """One of them states other axes; spz issue 84 and pull request 82."""
+def test_extensions_are_named_and_harmonics_beyond_degree_3_refused(tmp_path, caplog):
+    """An extension may state other axes; spz issue 84 and pull request 82."""
     write_gaussians(tmp_path / "a.spz", gaussians(5, 1, "display"))
-    data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
-    data[14] |= 2  # A flag says that extensions lie behind the Gaussians.
-    extension = struct.pack("<III", 0xADBE0003, 4, 5)
-    (tmp_path / "b.spz").write_bytes(gzip.compress(bytes(data) + extension))
+    plain = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    flagged = plain[:14] + bytes([plain[14] | 2]) + plain[15:]  # Extensions lie behind the Gaussians.
+    (tmp_path / "b.spz").write_bytes(gzip.compress(flagged + struct.pack("<III", 0xADBE0003, 4, 5)))
     np.testing.assert_array_equal(read_gaussians(tmp_path / "b.spz").means, read_gaussians(tmp_path / "a.spz").means)
     assert "b.spz: its extensions are not read" in caplog.text and "a.spz" not in caplog.text
-
-
-def test_harmonics_beyond_degree_3_are_named(tmp_path):
-    write_gaussians(tmp_path / "a.spz", gaussians(5, 1, "display"))
-    data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
-    data[12] = 4
-    (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
+    (tmp_path / "c.spz").write_bytes(gzip.compress(plain[:12] + b"\4" + plain[13:]))
     with pytest.raises(InputError, match="has harmonics of degree 4; export it with degree 0 to 3"):
-        read_gaussians(tmp_path / "a.spz")
+        read_gaussians(tmp_path / "c.spz")

@@ -1,6 +1,5 @@
 """Gain maps from files that the test writes: light behind white against the light they were made of."""
 
-import json
 import logging
 import struct
 
@@ -13,6 +12,7 @@ from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.color.primaries import matrix_to_rec709
 from sehdr_warp.scene.images.gain_map import light_of, read_gain_map
 from sehdr_warp.scene.images.ldr_files import read_ldr
+from tests.make_scenes import write_frames
 
 from ..color.test_encoding import icc_profile
 from .gain_map_files import (
@@ -195,13 +195,13 @@ def test_a_map_of_more_pixels_than_its_photo_counts_as_none(tmp_path, caplog):
     )
 
 
-def write_set(folder, count=4):
-    """Posed photos with gain maps, all of one scene."""
-    light, base, gain = pair()
-    for i in range(count):
-        write_jpeg_pair(folder / f"{i}.jpg", base, gain, [iso_segment()])
-    frames = [{"file_path": f"{i}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(count)]
-    (folder / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
+def write_set(folder, segment=None, channels=1, **options):
+    """Four posed photos with gain maps, all of one scene."""
+    light, base, gain = pair(channels=channels)
+    names = [f"{i}.jpg" for i in range(4)]
+    for name in names:
+        write_jpeg_pair(folder / name, base, gain, [segment or iso_segment(channels=channels)], **options)
+    write_frames(folder, names, (WIDTH, HEIGHT))
     return light
 
 
@@ -254,12 +254,7 @@ def test_a_gain_map_is_turned_with_its_photo(tmp_path):
 def test_light_of_a_display_p3_photo_ends_in_rec709(tmp_path):
     """A profile states the primaries of photo and map; its curve is that of sRGB."""
     colour = pytest.importorskip("colour")
-    light, base, gain = pair(channels=3)
-    profile = icc_profile("Display P3")
-    frames = [{"file_path": f"{i}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
-    for i in range(3):
-        write_jpeg_pair(tmp_path / f"{i}.jpg", base, gain, [iso_segment(channels=3)], icc_profile=profile)
-    (tmp_path / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
+    light = write_set(tmp_path, channels=3, icc_profile=icc_profile("Display P3"))
     view = load_scene(tmp_path).views[0]
     spaces = colour.RGB_COLOURSPACES
     matrix = colour.matrix_RGB_to_RGB(spaces["Display P3"], spaces["sRGB"])
@@ -281,14 +276,8 @@ def test_a_photo_without_a_map_in_such_a_set_is_clipped_at_white(tmp_path):
 @pytest.mark.parametrize("stops", [0.0, 9.0])
 def test_maps_of_no_and_of_many_stops(tmp_path, stops):
     """Beyond four stops light lies beside codes, so that 16 bits keep the dark."""
-    frames = [{"file_path": f"{i}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
-    _, base, gain = pair()
-    for i in range(3):
-        body = hdrgm()[1].replace(b'GainMapMax="2.5"', f'GainMapMax="{stops}"'.encode())
-        write_jpeg_pair(tmp_path / f"{i}.jpg", base, gain, [(0xFFE1, body)])
-    (tmp_path / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
-    scene = load_scene(tmp_path)
-    assert scene.views[0].exposure_time == pytest.approx(0.97 * 2 ** -min(stops, 4))
+    write_set(tmp_path, hdrgm(GainMapMax=str(stops)))
+    assert load_scene(tmp_path).views[0].exposure_time == pytest.approx(0.97 * 2 ** -min(stops, 4))
 
 
 @pytest.mark.parametrize("behind", [b"", b"a film" * 50], ids=["alone", "motion photo"])

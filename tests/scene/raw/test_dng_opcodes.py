@@ -1,6 +1,5 @@
 """Opcodes of DNG, undone by their inverses."""
 
-import json
 import struct
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.raw.decode import read_raw
+from tests.make_scenes import write_frames
 
 from .dng_files import (
     EVEN,
@@ -69,8 +69,7 @@ def test_light_above_white_stays_with_a_view_that_is_averaged(tmp_path):
     for i in range(3):
         light = np.full((HEIGHT, WIDTH, 3), 0.5) + 0.1 * X[..., None] / WIDTH
         write_tagged_dng(tmp_path / f"{i}.dng", stored(mosaic(light)), LEVELS | {51009: opcodes(*maps)})
-    frames = [{"file_path": f"{i}.dng", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
-    (tmp_path / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "fl_x": 100, "frames": frames}))
+    write_frames(tmp_path, [f"{i}.dng" for i in range(3)], (WIDTH, HEIGHT))
     view = load_scene(tmp_path, max_size=WIDTH // 4).views[0]
     expected = 0.6 * gains[0, 0]
     assert view.light_above_white[0, -1] == pytest.approx(expected, rel=0.1)
