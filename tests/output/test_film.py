@@ -6,16 +6,19 @@ import subprocess
 import sys
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError, SehdrError
+from sehdr_warp.output.commands import FilmOptions, Render, run_render
 from sehdr_warp.output.film import encode, write_film
 from sehdr_warp.output.images.display import display_gain
 from sehdr_warp.output.render_views import shared_tone_map
+from sehdr_warp.own_files import LIST
 
-from .helpers import smooth_run
+from .helpers import AnalyticRun, smooth_run
 
 av = pytest.importorskip("av")
 
@@ -94,6 +97,43 @@ def test_a_ramp_runs_through_the_stops(tmp_path):
         assert picture.mean() == pytest.approx(encode(light * 2.0**stops, "sdr").mean(), abs=0.01)
 
 
+@pytest.mark.parametrize(
+    "name", ["f.mpd", "f.m3u8", "f.gif", "f.webm", "f.png", "f", "f.mp4.txt", "f%d.jpg", "f.ffconcat", "f.sdp", "f.tee"]
+)
+def test_formats_of_several_files_and_none_are_refused_before_the_work(tmp_path, name):
+    run = AnalyticRun()
+    (tmp_path / "init-stream0.m4s").write_text("the user's own")
+    with pytest.raises(InputError, match="is not the suffix of a film; use one of .mp4"):
+        write_film(run, tmp_path / name, [run.cameras[0].camera])
+    assert run.rendered == 0 and [each.name for each in tmp_path.iterdir()] == ["init-stream0.m4s"]
+
+
+@pytest.mark.parametrize(
+    "name", ["http://127.0.0.1:9/f.mp4", "rtmp://host/f.mp4", "file:///tmp/f.mp4", "concat:/f.mp4"]
+)
+def test_urls_are_refused(name):
+    for out in (name, Path(name)):
+        with pytest.raises(InputError, match="is a URL; name a file"):
+            write_film(AnalyticRun(), out, [AnalyticRun().cameras[0].camera])
+
+
+@pytest.mark.parametrize("name", ["tour-12:30.mp4", "data:x.mkv", "crypto:f.mov", "-y.mp4", "a|b.mkv", "f%03d.avi"])
+def test_names_that_ffmpeg_takes_for_more_are_names(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    write_film(AnalyticRun(), name, [entry.camera.resized(1, 1) for entry in AnalyticRun().cameras[:2]])
+    assert [each.name for each in tmp_path.iterdir() if each.name != LIST] == [name]
+    assert len(frames(f"file:{name}")[0]) == 2
+
+
+@pytest.mark.parametrize("fps", [1e300, 1e4, 1e-3, 0.0, -24.0, float("nan"), float("inf")])
+def test_rates_that_no_film_has_are_refused(tmp_path, fps):
+    with pytest.raises(SehdrError, match="frames a second are not between"):
+        write_film(AnalyticRun(), tmp_path / "f.mp4", [AnalyticRun().cameras[0].camera], fps=fps)
+    for films in ({}, {"video": tmp_path / "f.mp4"}):  # Before the scene, which is not there, is opened.
+        with pytest.raises(SehdrError, match="frames a second are not between"):
+            run_render(Render(run=tmp_path, out=tmp_path / "o", cameras="orbit", film=FilmOptions(fps=fps), **films))
+
+
 def test_small_hevc_films_leave_memory_whole(tmp_path):
     """In a process whose allocator checks each block when it is freed."""
     checker = "libc_malloc_debug.so.0"
@@ -118,8 +158,6 @@ def test_refusals(tmp_path, monkeypatch):
     (tmp_path / "mine.mp4").write_text("mine")
     with pytest.raises(InputError, match="exists already"):
         write_film(run, tmp_path / "mine.mp4", cameras)
-    with pytest.raises(SehdrError, match="is not the suffix of a film; use one of .mp4"):
-        write_film(run, tmp_path / "film.txt", cameras)
     with pytest.raises(SehdrError, match="cannot be written as a film .* choose .mov"):
         write_film(run, tmp_path / "film.mp4", cameras, transfer="logc3")
     assert [file.name for file in tmp_path.iterdir()] == ["mine.mp4"]
