@@ -19,19 +19,21 @@ TOPICS = {
 """Tests of what several modules of a package do together. Prefer a module's name."""
 ELSEWHERE = {
     "with their kernels, in tests/kernels": [
-        "rasterizer/absolute_gradient", "rasterizer/blending*", "rasterizer/gradients", "rasterizer/losses/*",
-        "rasterizer/ops/*",
+        "rasterizer/absolute_gradient", "rasterizer/blending*", "rasterizer/losses/*", "rasterizer/ops/*",
+    ],
+    "with kernels that compute the same, or what launches them": [
+        "kernels/blend_cuda_backward", "kernels/caller_memory", "kernels/plane_sweep_cpu", "kernels/shared_ranges",
+        "kernels/ssim_cuda",
     ],
     "with what calls them, in other tests of their folder": [
-        "blocks/seams", "compat/gsplat/parameter_rows", "compat/gsplat/relocation", "compat/gsplat/strategy/*",
-        "model/color_models", "prior/network", "rasterizer/caller_lists", "rasterizer/cuda_graphs/render_graph",
+        "blocks/seams", "prior/network", "rasterizer/caller_lists", "rasterizer/cuda_graphs/render_graph",
         "rasterizer/warp_launch/loading", "rasterizer/warp_launch/packing",
     ],
     "on the command line": ["evaluation/commands", "runs/commands", "scene/commands", "training/commands"],
     "by being part of tests": ["check/*", "rasterizer/reference"],
     "not alone: a few lines, names or types": [
-        "caches", "model/renders", "rasterizer/render_options", "response/names", "runs/field", "scene/images/xmp",
-        "training/training_progress",
+        "caches", "kernels/constants", "model/renders", "rasterizer/render_options", "response/names", "runs/field",
+        "scene/images/xmp", "training/training_progress",
     ],
 }  # fmt: skip
 """Modules without a test of their name, by how they are tested."""
@@ -54,11 +56,10 @@ def test_a_test_has_the_name_of_its_module():
 
 
 def test_a_module_has_a_test_of_its_name_or_is_named_here():
-    files = (path.relative_to(ROOT / "sehdr_warp") for path in (ROOT / "sehdr_warp").rglob("[!_]*.py"))
+    folders = (ROOT, "kernels"), (ROOT / "sehdr_warp", "")
+    files = {path.relative_to(root) for root, folder in folders for path in (root / folder).rglob("[!_]*.py")}
     alone = {
-        file.with_suffix("").as_posix()
-        for file in files
-        if file.parts[0] != "kernels" and not (TESTS / file.parent / f"test_{file.name}").is_file()
+        file.with_suffix("").as_posix() for file in files if not (TESTS / file.parent / f"test_{file.name}").is_file()
     }
     patterns = [pattern for group in ELSEWHERE.values() for pattern in group]
     unnamed = [module for module in sorted(alone) if not any(fnmatch(module, pattern) for pattern in patterns)]
