@@ -49,8 +49,8 @@ FORMATS = {
 """By suffix, and by name for streamed SOG."""
 SUFFIXES = tuple(suffix for suffix in FORMATS if suffix != STREAMED_SOG)
 _OTHER = {
-    ".splat": "holds 8 bits and no harmonics",
-    ".ksplat": "holds a viewer's own compression",
+    ".splat": "holds 8 bits and no harmonics; SplatTransform makes a PLY of it",
+    ".ksplat": "holds a viewer's own compression; SplatTransform makes a PLY of it",
     ".gltf": "is glTF in pieces",
 }
 
