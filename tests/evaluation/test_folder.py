@@ -23,7 +23,7 @@ def write_pictures(folder, factors):
     return folder
 
 
-def test_a_folder_scores_as_a_run_that_renders_it(tmp_path, logged):
+def test_a_folder_scores_as_a_run_that_renders_it(tmp_path):
     folder = write_pictures(tmp_path / "out", dict.fromkeys(range(4), 0.5))
     ours, theirs = sw.evaluate_folder(folder, scene(VIEWS)), evaluate(run(lambda hdr: hdr * 0.5), scene(VIEWS))
     for name, figures in theirs["protocol"].items():

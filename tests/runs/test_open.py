@@ -113,7 +113,7 @@ def test_other_pictures_under_the_names_of_the_photos_are_named(bare_run, tmp_pa
     assert line.startswith(f"{moved}: 1 of 9 photos ") and line.endswith(name)
 
 
-def test_a_time_that_was_estimated_by_points_is_the_same_when_a_training_goes_on(bare_run, tmp_path):
+def test_a_time_that_was_estimated_by_points_is_the_same_when_a_training_goes_on(bare_run):
     """Points come from structure from motion, which a run with cameras does without."""
     folder, run, cameras = bare_run
     times = {f"{name}.png": 0.01 for name in sorted(cameras)[1:]}

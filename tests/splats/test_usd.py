@@ -75,3 +75,9 @@ def test_transforms_of_openusd_are_named(tmp_path, value):
     (tmp_path / "b.usda").write_text(text.replace("point3f[] positions", moved, 1))
     with pytest.raises(InputError, match="moved by a transform"):
         read_gaussians(tmp_path / "b.usda")
+
+
+def test_a_file_made_by_hand(shared):
+    pytest.importorskip("pxr")
+    minimal = read_gaussians(shared / "data" / "splats" / "handmade_minimal.usda")
+    assert minimal.count == 2 and minimal.harmonics[1, 0, 0] > 10

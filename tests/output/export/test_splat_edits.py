@@ -143,7 +143,7 @@ def test_edits_that_leave_nothing_say_where_the_scene_is(tmp_path, run, monkeypa
             SplatEdits(**options)
 
 
-def test_strays_come_near_or_go(tmp_path, logged):
+def test_strays_come_near_or_go(logged):
     cameras = [camera(position=(i - 1, 0, -6)) for i in range(3)]
     original = splats([(0, 0, 0), (0, 0, 1e5), (0, 1e6, 0)], [0.9, 0.9, 0.007], scale=10.0)
     result = without_strays(original, cameras)

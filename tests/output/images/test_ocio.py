@@ -49,7 +49,7 @@ def test_what_a_config_lacks_is_named(tmp_path):
         render_views(AnalyticRun(), tmp_path / "out", view="Raw")
 
 
-def test_color_spaces_have_the_names_and_matrices_of_openexr(tmp_path):
+def test_color_spaces_have_the_names_and_matrices_of_openexr():
     """colorInteropID is an identifier of the Color Interop Forum, which OpenColorIO's own spaces state."""
     config = OCIO.Config.CreateFromFile(CONFIG)
     names = {space.getInteropID(): space.getName() for space in config.getColorSpaces()}

@@ -29,12 +29,6 @@ from sehdr_warp.splats import GaussianArrays
 from ..helpers import LIGHT, Entry, camera, lamps
 
 
-@pytest.fixture
-def run(tmp_path):
-    cameras = tuple(Entry(str(i), "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0, 0, 9))) for i in range(3))
-    return Splats(tmp_path / "run", field_of(lamps()), cameras)
-
-
 def read(path):
     channels, header = read_exr_channels(path)
     return np.stack([channels[name] for name in "RGB"], axis=2), channels, header

@@ -11,7 +11,6 @@ import torch
 from sehdr_warp.errors import InputError, SehdrError, UsageError
 from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.commands import Lights, WorldOptions, run_lights
-from sehdr_warp.output.lighting import lights as lighting
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles, write_environment_map
 from sehdr_warp.output.lighting.lights import lights_table, write_lights
 from sehdr_warp.output.world_transform import world_transform
@@ -20,18 +19,12 @@ from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
 from sehdr_warp.splats import GaussianArrays
 
-from ..helpers import LIGHTS, PANEL, Entry, camera, lamps, received
+from ..helpers import LIGHTS, PANEL, Entry
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
-    """A scene of six lamps, of which three belong to two lights."""
-    cameras = tuple(Entry(str(i), "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0, 0, 9))) for i in range(3))
-    scene = Splats(tmp_path / "run", field_of(lamps()), cameras)
-    scene.find_lights = lambda: LIGHTS
-    # Lights that reach every place with their radiance.
-    monkeypatch.setattr(lighting, "received_light", lambda field, place, *_, **__: received(place))
-    return scene
+def run(lit):
+    return lit
 
 
 def test_json_has_every_figure(tmp_path, run):

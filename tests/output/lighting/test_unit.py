@@ -9,19 +9,16 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError, SehdrError
-from sehdr_warp.model.baking import field_of
 from sehdr_warp.output.images.display import exposure_for_white
 from sehdr_warp.output.images.tonemap import LUMINANCE
-from sehdr_warp.output.lighting import lights
 from sehdr_warp.output.lighting.environment_map import write_environment_map
 from sehdr_warp.output.lighting.lights import lights_table, write_lights
 from sehdr_warp.output.lighting.unit import EFFICACY, meter, read_light_unit
 from sehdr_warp.output.render_views import render_views
-from sehdr_warp.runs.run import Splats
 from sehdr_warp.runs.values import LIGHT_UNIT_FILE
 from sehdr_warp.scene.images.hdr_files import read_exr_channels, read_hdr
 
-from ..helpers import LIGHTS, AnalyticRun, Entry, camera, lamps, received
+from ..helpers import LIGHTS, AnalyticRun
 
 
 @pytest.fixture
@@ -32,19 +29,6 @@ def run(tmp_path):
     sky.path.mkdir()
     sky.render_clipped = lambda camera: None
     return sky
-
-
-@pytest.fixture
-def lit(tmp_path, monkeypatch):
-    """A scene of six lamps, of which three belong to two lights."""
-    cameras = tuple(
-        Entry(f"r_{i}", "train", camera(position=(0.1 * i - 0.1, 0, 0), target=(0.3, 0.2, 9))) for i in range(3)
-    )
-    scene = Splats(tmp_path / "lit", field_of(lamps()), cameras)
-    scene.path.mkdir()
-    scene.find_lights = lambda: LIGHTS
-    monkeypatch.setattr(lights, "received_light", lambda field, place, *_, **__: received(place))
-    return scene
 
 
 def light_at(run, name, x, y):
@@ -81,7 +65,7 @@ def test_pictures_and_maps_state_the_unit_and_keep_their_values(run, tmp_path):
 
 def test_radiance_files_hold_watts(lit, tmp_path):
     plain = write_environment_map(lit, tmp_path / "plain.hdr", size=32)
-    unit = meter(lit, "r_0", (16, 12), luminance=250.0).luminance
+    unit = meter(lit, "0", (16, 12), luminance=250.0).luminance
     path = write_environment_map(lit, tmp_path / "map.hdr", size=32)
     assert plain.read_bytes().count(b"EXPOSURE") == 0
     # Readers divide values by EXPOSURE for W / (sr m^2), and programs of Radiance take 179 lm for each W.
@@ -91,7 +75,7 @@ def test_radiance_files_hold_watts(lit, tmp_path):
 
 
 def test_lights_are_in_candelas(lit, tmp_path):
-    unit = meter(lit, "r_0", (16, 12), luminance=250.0).luminance
+    unit = meter(lit, "0", (16, 12), luminance=250.0).luminance
     write_lights(lit, tmp_path / "lights.json", axes="scene")
     lights_file = json.loads((tmp_path / "lights.json").read_text())
     assert lights_file["units"] == "cd/m^2, linear Rec.709"
@@ -102,7 +86,7 @@ def test_lights_are_in_candelas(lit, tmp_path):
 
 
 def test_lights_are_in_the_units_of_plates_with_a_reference_white(lit, tmp_path):
-    meter(lit, "r_0", (16, 12), luminance=250.0)
+    meter(lit, "0", (16, 12), luminance=250.0)
     factor = exposure_for_white(lit, 2.0)
     write_lights(lit, tmp_path / "lights.json", axes="scene", reference_white=2.0)
     lights_file = json.loads((tmp_path / "lights.json").read_text())
