@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .trainer import Trainer
 
 STILL_RISING = 0.2  # dB that held-out photos gained in the last third of the steps, or since a resume, if too few
-UNFINISHED = 0.5  # dB gained there from which blur explains what differs from the photos, and not their exposure
+UNFINISHED = 0.5  # dB gained there from which blur explains what differs from the photos, not exposure or cameras
 FALLING = 0.5  # dB that they lost since their best in a training that overfits; seeds differ by up to 0.3 dB
 EXPOSURE_JUMP = 0.4  # Stops between a whole photo and the scene from which its exposure is not as stated
 FAILED = 17.0  # dB of held-out photos below which the scene as a whole is wrong: sound captures have 19 to 35
@@ -131,9 +131,11 @@ class FinishedTraining:
             elif not few_placed and train_photos < _FEW_PHOTOS and points[-1].psnr < 25:
                 nearer = "more from places between them, and nearer, would help most"
                 lines.append(f"{train_photos} photos are few: {nearer}: {again}")
+        if gain >= UNFINISHED:
+            return lines
         if wrong := self._wrong_cameras():
             lines.append(wrong)
-        elif gain < UNFINISHED and (is_long or len(points) not in (1, 2)):  # Few do not show whether blur goes away.
+        elif is_long or len(points) not in (1, 2):  # Few do not show whether blur goes away.
             if jump := self._exposure_jump():
                 lines.append(jump)
             elif not few_placed and not points and train_photos < _FEWEST_PHOTOS:  # Nothing tells blur from movement.

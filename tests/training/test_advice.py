@@ -131,7 +131,7 @@ def test_few_photos_and_movement():
 def test_single_photos_that_show_another_scene_have_wrong_cameras():
     figures, sizes = summary([28, 28, 28]), {f"p{i}": 1000 for i in range(40)}
 
-    def lines(photos, stops=7.0, pixels=80, offset=0.0, **options):
+    def lines(photos, stops=7.0, pixels=80, offset=0.0, figures=figures, **options):
         worst = [{"photo": f"p{i}", "stops": sign * stops, "pixels": pixels} for i in range(photos) for sign in (1, -1)]
         found = {"unexplained": {"regions": len(worst), "worst": worst}, "brightness_offsets": {"p0": offset}}
         return advice(Path("r"), figures | found, 40, **{"sizes": sizes} | options)
@@ -141,6 +141,8 @@ def test_single_photos_that_show_another_scene_have_wrong_cameras():
     [line] = lines(1)
     assert line.startswith("the camera of p0 seems wrong: this photo alone shows") and "; move it elsewhere: " in line
     assert lines(2, pixels=50) == lines(2, stops=2.0) == lines(5) == lines(2, sizes={}) == []
+    [line] = lines(1, figures=summary([26, 27, 28]))
+    assert "more steps help" in line
     [line] = lines(1, offset=5.0)
     assert line.startswith("1 photo is brighter or darker")
 
