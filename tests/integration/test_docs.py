@@ -127,6 +127,11 @@ def test_the_site_lists_every_page():
     assert not missing, f"add them to nav in mkdocs.yml: {missing}"
 
 
+def test_the_api_page_lists_every_public_name():
+    listed = set(re.findall(r"^::: \S+\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE))
+    assert set(sehdr_warp.__all__) <= listed, f"add to docs/api.md: {set(sehdr_warp.__all__) - listed}"
+
+
 # Words on one page. A page that outgrows its budget is split by topic or shortened.
 WORD_BUDGETS = {"README.md": 700, "CONTRIBUTING.md": 1500, "CHANGELOG.md": 3600}
 GUIDE_PAGE_WORDS = 2200
