@@ -45,3 +45,11 @@ def test_poison_stays_and_black_is_black(device):
         assert value[0].isnan() and slope[0].isnan()
         assert value[1] == 0
         assert value[2] > 1 - 1e-6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_extreme_exposures_have_the_values_and_slopes_of_float64(device, name):
+    extreme = torch.tensor([-1e30, -0.0, 1e-45, 1e-30, 1e30, 3e38], device=device)
+    results = [encode_with_slope(each, response_by_name(name).curve, 0.05) for each in (extreme, extreme.double())]
+    for ours, truth in zip(*results, strict=True):
+        torch.testing.assert_close(ours.double(), truth, rtol=1e-3, atol=1e-6)
