@@ -126,18 +126,16 @@ def test_the_pixels_of_a_panorama_are_no_mask(tmp_path):
     np.testing.assert_allclose(mask_shares(scene.field, [painted]), [0.5, 1, 1, 0.5], atol=0.05)
 
 
-def test_edits_that_leave_nothing_say_where_the_scene_is(tmp_path, run, monkeypatch):
+def test_edits_that_leave_nothing_say_where_the_scene_is_before_colors_are_fitted(tmp_path, run, logged):
     with pytest.raises(
         SehdrError, match=r"leave no Gaussian; the scene lies at .* in the coordinates of these regions"
     ):
         export(run, tmp_path / "a.ply", edits=SplatEdits(crop="sphere:99,0,0,1"))
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            "sehdr_warp.output.export.gaussians.gaussians_of", lambda *_, **__: pytest.fail("colors were fitted first")
-        )
-        with pytest.raises(SehdrError, match="leave no Gaussian"):
-            export(run, tmp_path / "a.ply", edits=SplatEdits(cut="box:-99,-99,-99,99,99,99"))
-    assert not (tmp_path / "a.ply").exists()
+    with pytest.raises(SehdrError, match="leave no Gaussian"):
+        export(run, tmp_path / "a.ply", exposure_time=9.0, edits=SplatEdits(cut="box:-99,-99,-99,99,99,99"))
+    assert not (tmp_path / "a.ply").exists() and not any(line.startswith("fitting") for line in logged)
+    export(run, tmp_path / "a.ply", exposure_time=9.0)
+    assert any(line.startswith("fitting") for line in logged)
     for options in ({"min_opacity": 1.0}, {"min_opacity": -0.1}, {"min_views": -1}):
         with pytest.raises(SehdrError, match=next(iter(options))):
             SplatEdits(**options)
