@@ -43,6 +43,21 @@ def test_values_and_gradients_are_the_references(device, dtype, bound, antialias
         assert relative_error(mine.grad, true.grad) < bound, name
 
 
+@pytest.mark.parametrize("length", [1e-18, 1e-12, 1e12, 1e18])
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
+def test_quaternions_of_any_length_turn_alike(device, dtype, bound, length):
+    results = []
+    for factor in (1.0, length):
+        tensors = inputs(count=20)
+        tensors[2] = (factor * tensors[2]).detach()
+        leaves = [tensor.to(device, dtype).requires_grad_() for tensor in tensors]
+        conics = project_to_camera(*leaves, OPTIONS).conics
+        (conics * random_like(conics, 1)).sum().backward()
+        results.append((conics, factor * leaves[2].grad.double()))
+    for ours, truth in zip(*results[::-1], strict=True):
+        assert relative_error(ours, truth) < bound and truth.any()
+
+
 @pytest.mark.parametrize("which", [1, 2], ids=["log_scales", "quaternions"])
 def test_the_compensation_is_differentiated_where_asked(device, which):
     tensors = inputs(count=8, spread=1.0)

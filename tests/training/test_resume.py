@@ -172,20 +172,25 @@ def test_a_run_that_was_left_in_its_moving_average_goes_on_with_more_iterations(
     assert resumed.train().iterations == 180 and resumed.field.gaussians.count != count
 
 
-def test_resuming_with_the_same_config_keeps_the_planned_length(scene, tmp_path):
+def test_resuming_with_the_same_config_keeps_the_length_of_the_run(scene, tmp_path):
+    """The planned one, and that to which it was stretched later."""
     config = load_config("default", {"model.initial_density": 4.0, "mcmc.cap_density": 4.0})
+
+    def resumed(config):
+        trainer = create_trainer(scene, tmp_path / "run", config, device="cpu", resume=True)
+        trainer.output.folder.unlock()
+        return trainer
+
     trainer = create_trainer(scene, tmp_path / "run", config, device="cpu")
     planned = trainer.total
     assert planned < config.schedule.iterations
     for _ in trainer:
         break
-    again = create_trainer(scene, tmp_path / "run", config, device="cpu", resume=True)
-    assert again.total == planned
-    again.output.folder.unlock()
+    assert resumed(config).total == planned
+    longer = override_config(trainer.config, {"schedule.iterations": planned + 9})
+    assert resumed(longer).total == resumed(config).total == planned + 9
     named = override_config(config, {"schedule.iterations": planned + 50, "plan.keep": ["schedule.iterations"]})
-    longer = create_trainer(scene, tmp_path / "run", named, device="cpu", resume=True)
-    assert longer.total == planned + 50
-    longer.output.folder.unlock()
+    assert resumed(named).total == planned + 50
 
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
@@ -212,17 +217,6 @@ def test_a_preset_in_python_does_not_stretch_a_run_and_stated_iterations_do(scen
     stated = (({"seed": 0}, 2), ({"schedule.iterations": 3}, 3), ({"schedule": {"iterations": 4}}, 4))
     for fields, iterations in stated:
         assert train(scene, tmp_path / "fields", fields, device="cpu", resume=True).iterations == iterations
-
-
-def test_a_planned_run_that_was_stretched_is_resumed_with_its_preset(scene, tmp_path):
-    config = load_config("default", {"model.initial_density": 4.0, "mcmc.cap_density": 4.0})
-    trainer = create_trainer(scene, tmp_path / "run", config, device="cpu")
-    longer, total = override_config(trainer.config, {"schedule.iterations": trainer.total + 9}), trainer.total + 9
-    trainer.output.folder.unlock()
-    for resumed in (longer, config):
-        trainer = create_trainer(scene, tmp_path / "run", resumed, device="cpu", resume=True)
-        assert trainer.total == total
-        trainer.output.folder.unlock()
 
 
 def test_a_finished_training_that_goes_on_for_much_longer_loses_nothing_first(scene, trained, tmp_path):
