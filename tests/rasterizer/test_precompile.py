@@ -13,6 +13,7 @@ from sehdr_warp.kernels.plane_sweep_cpu import sweep_rows
 from sehdr_warp.kernels.shared_ranges import share_ranges
 from sehdr_warp.rasterizer import precompile
 from sehdr_warp.rasterizer.warp_launch import launching
+from sehdr_warp.rasterizer.warp_launch.packing import PackedLaunch
 from sehdr_warp.runs.config_files import load_config
 
 
@@ -58,13 +59,20 @@ def test_what_cannot_be_compiled_is_no_end_of_the_block(monkeypatch):
     assert not is_loaded(broken)
 
 
-def test_a_training_launches_what_was_compiled_ahead():
+def test_a_training_launches_what_was_compiled_ahead(monkeypatch):
+    launched = {sweep_rows, share_ranges}
+    for name in ("launch", "launch_ranges"):
+
+        def watched(packed, *arguments, method=getattr(PackedLaunch, name)):
+            launched.add(packed.command.kernel)
+            method(packed, *arguments)
+
+        monkeypatch.setattr(PackedLaunch, name, watched)
     scene = make_photo_scene(Size(200, 48, 48), 2)
     trainer = make_trainer(scene, load_config("default", {"response.name": "srgb"}), torch.device("cpu"))
     changing = trainer.iteration - 1
     for iteration in (0, changing):  # The first step, and one that changes the Gaussians
         trainer.iteration = iteration
         trainer.step()
-    launched = {kernel for kernel, *_ in launching._of_thread.launches} | {sweep_rows, share_ranges}
     assert launched.issuperset(precompile.training_kernels(3, antialiased=False))
     assert launched.issuperset(precompile.training_kernels(None, antialiased=False))
