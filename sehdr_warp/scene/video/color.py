@@ -132,7 +132,7 @@ def read_color(container: Any, stream: Any, frame: Any, path: Path) -> VideoColo
     if transfer == 8:
         return replace(color, curve="linear", response="linear")
     display = encoding_of_code_points(_UNSPECIFIED, _GAMMA_28) if transfer == _GAMMA_28 else None
-    return replace(color, curve=_CURVE_NAMES.get(transfer, "no stated curve"), display=display)
+    return replace(color, curve=_CURVE_NAMES.get(transfer, "no curve"), display=display)
 
 
 def _log_curve(texts: list[tuple[str, str]], transfer: int, primaries: int, bits: int) -> tuple[str, str] | None:

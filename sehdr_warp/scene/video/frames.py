@@ -154,10 +154,8 @@ def read_video(path: Path, cache: Path | str | None = None) -> DataparserOutputs
     dataset = find_photos(folder)
     count = len(list_images(folder, (".png",)))
     color = clip.color
-    response_note = f"its response is {color.response}" if color.response else "its response is chosen as for photos"
-    note = (
-        f"video: the sharpest {count} of {facts['total']} frames are used; its curve is {color.curve}: {response_note}"
-    )
+    note = f"video: the sharpest {count} of {facts['total']} frames are used; it states {color.curve}: its response is "
+    note += color.response or "that of --response, or else chosen as for photos"
     squared = (f"its pixels are not square: frames are resampled to {clip.size[0]} x {clip.size[1]} square pixels",)
     interlaced = ("its frames are interlaced, rows of two moments each: deinterlace the clip for sharp edges",)
     return replace(

@@ -131,7 +131,8 @@ def test_an_hlg_clip_of_a_room_becomes_a_scene(tmp_path):
     assert scene.format == "video" and scene.name == "clip.mov" and scene.response.name == response.name
     assert response_for_training(scene, Config()) is scene.response, "the stated curve is not guessed again"
     assert any(
-        note.startswith("video: the sharpest ") and "of 12 frames" in note and "HLG" in note for note in scene.notes
+        note.startswith("video: the sharpest ") and "of 12 frames" in note and "it states HLG: " in note
+        for note in scene.notes
     ), scene.notes
     assert 8 <= len(scene.views) <= 12 and len(scene.points) > 100
     np.testing.assert_allclose(scene.color_matrix.sum(1), 1, atol=1e-3)
