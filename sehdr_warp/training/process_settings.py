@@ -6,7 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -17,6 +17,10 @@ from ..rasterizer.precompile import precompiled, training_kernels
 from ..runs.config import Config
 
 SWITCH_SECONDS = 2e-4  # Interval after which a waiting thread requests the interpreter's lock; Python's 5 ms are long
+
+_memory: Any = torch.utils.deterministic
+_blocks: list["_Settings"] = []  # For each open block of torch_settings(), the settings before the first one
+_blocks_lock = threading.Lock()
 
 
 def machine_figures(device: torch.device) -> dict:
@@ -40,35 +44,55 @@ def precompiling(config: Config) -> AbstractContextManager[None]:
     return precompiled(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
 
 
+class _Settings(NamedTuple):
+    """Settings of the process that a training changes."""
+
+    threads: int
+    deterministic: bool
+    fills_memory: bool  # Whether torch fills new memory while deterministic, for finding errors
+    switch_interval: float  # Seconds
+
+    @staticmethod
+    def current() -> "_Settings":
+        deterministic, fills = torch.are_deterministic_algorithms_enabled(), _memory.fill_uninitialized_memory
+        return _Settings(torch.get_num_threads(), deterministic, fills, sys.getswitchinterval())
+
+    def restore(self) -> None:
+        torch.set_num_threads(self.threads)
+        sys.setswitchinterval(self.switch_interval)
+        if self.deterministic != torch.are_deterministic_algorithms_enabled():  # The call loads torch's compiler, 2 s.
+            torch.use_deterministic_algorithms(self.deterministic)
+        _memory.fill_uninitialized_memory = self.fills_memory
+
+
 @contextmanager
 def torch_settings(deterministic: bool) -> Iterator[None]:
     """Apply torch's settings for a training within this block.
 
     torch runs on one thread, so that its sums do not depend on the number of cores; this costs nothing, because the
     kernels have their own threads, and the interpreter's lock is handed over sooner. If `deterministic`, sums on a GPU
-    have a fixed order too.
+    have a fixed order too. Blocks may overlap, as those of two trainers that take turns: the last one that ends
+    restores what the first one found.
     """
-    threads, was_deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
-    memory: Any = torch.utils.deterministic
-    fills_memory = memory.fill_uninitialized_memory
-    interval = sys.getswitchinterval()
+    with _blocks_lock:
+        if not _blocks:
+            _keep_memory(True)
+        _blocks.append(_blocks[0] if _blocks else _Settings.current())
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_SECONDS)
-    _keep_memory(True)
     if deterministic:
         # cuBLAS is deterministic only with a fixed workspace; it reads this variable at its first use.
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         torch.use_deterministic_algorithms(True)
-        memory.fill_uninitialized_memory = False
+        _memory.fill_uninitialized_memory = False
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
-        sys.setswitchinterval(interval)
-        _keep_memory(False)
-        if deterministic:  # Guarded, because the call loads torch's compiler, two seconds.
-            torch.use_deterministic_algorithms(was_deterministic)
-        memory.fill_uninitialized_memory = fills_memory
+        with _blocks_lock:
+            before = _blocks.pop()
+            if not _blocks:
+                before.restore()
+                _keep_memory(False)
 
 
 def _keep_memory(keep: bool) -> None:

@@ -11,6 +11,7 @@ from sehdr_warp.rasterizer import custom_ops, differentiable, rasterize
 from .scenes import random_scene
 from .test_torch_contract import HEIGHT, WIDTH, directions, splats
 
+PYTHON = [sys.executable, "-W", "ignore:Guards may run slower", "-c"]  # As torch says of Python 3.13.0
 STEP = """
 import time, warnings
 import torch
@@ -49,7 +50,7 @@ print(seconds)
 
 
 def test_a_loop_is_one_graph_with_the_same_bits_in_silence():
-    done = subprocess.run([sys.executable, "-c", STEP], capture_output=True, text=True, check=False)
+    done = subprocess.run([*PYTHON, STEP], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert not done.stderr.strip(), done.stderr
     assert float(done.stdout) < 60
@@ -133,7 +134,7 @@ for function, leaves in cases:
 
 
 def test_compiled_autograd_calls_backward_passes_as_they_are():
-    done = subprocess.run([sys.executable, "-c", COMPILED_AUTOGRAD], capture_output=True, text=True, check=False)
+    done = subprocess.run([*PYTHON, COMPILED_AUTOGRAD], capture_output=True, text=True, check=False)
     assert done.returncode == 0 and not done.stderr.strip(), done.stderr
 
 

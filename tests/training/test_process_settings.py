@@ -24,6 +24,18 @@ def test_torchs_settings_are_those_of_before_also_after_an_error(deterministic):
     torch.set_num_threads(threads - 1)
 
 
+def test_trainings_that_take_turns_leave_the_settings_of_before_the_first():
+    before = torch.get_num_threads(), sys.getswitchinterval()
+    first, second = torch_settings(True), torch_settings(True)
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert torch.are_deterministic_algorithms_enabled() and torch.get_num_threads() == 1
+    second.__exit__(None, None, None)
+    assert not torch.are_deterministic_algorithms_enabled()
+    assert (torch.get_num_threads(), sys.getswitchinterval()) == before
+
+
 def test_figures_name_the_machine_and_its_memory():
     figures = machine_figures(torch.device("cpu"))
     assert figures["device"].startswith("cpu (") and figures["peak_memory_bytes"] > 1e7
