@@ -173,10 +173,6 @@ class McmcConfig(_Table):
     photos agree; 0 disables"""
     noise_lr: Annotated[float, Field(ge=0.0, le=1e12)] = 5e5
     """strength of the noise on positions, in units of their learning rate; 0 disables"""
-    prune_near_points: Fraction = 0.5
-    """relocate Gaussians that a training photo shows nearer than this share of the distance of its nearest points in
-    the set, of which 2 % do not count (floaters in front of cameras); not in parts of a photo without points, and not
-    where a photo shows less than a tenth of the scene; 0 disables"""
 
 
 class AdcConfig(_Table):

@@ -113,7 +113,6 @@ class CheckpointValues(Values):
     sha256: str
     run: Annotated[dict[str, str], Field(default_factory=dict)]
     large_scene: bool | None = None
-    nearest_points: list[list[float]] | list[float] | None = None
     median_depth: Annotated[FiniteFloat, Field(gt=0)] | None = None
 
 

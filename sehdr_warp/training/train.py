@@ -196,11 +196,7 @@ def _resumed_trainer(
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
     longer = config.continued_after(finished_at)
-    facts = point_facts_of(checkpoint)
-    if (distances := facts["nearest_points"]) is not None and len(distances) != len(scene.train_views):
-        problem = f"nearest_points has {len(distances)} values, and {len(scene.train_views)} photos are trained on"
-        raise InputError(checkpoint.path, problem, "remove it, or train again")
-    trainer = Trainer(scene, longer, field, ranks=ranks, **facts)
+    trainer = Trainer(scene, longer, field, ranks=ranks, **point_facts_of(checkpoint))
     try:
         load_state(trainer, checkpoint)
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:

@@ -45,7 +45,7 @@ from .run_output import RunOutput
 from .scene_facts import is_large
 from .seeding import make_seeds
 from .step_runner import StepRunner
-from .strategies import SEED_STRIDE, PointDistances, Seeds, TrainingCameras, distances_of_points, make_strategy
+from .strategies import SEED_STRIDE, Seeds, make_strategy
 from .training_progress import TrainingProgress
 
 log = logging.getLogger(__name__)
@@ -80,7 +80,6 @@ class Trainer:
         first_iteration: Iterations done before this process.
         total: Iterations in all.
         large_scene: Whether photos show little of the scene, see scene_facts.is_large().
-        nearest_points: Distances of the nearest points, see strategies.floaters; 0 in a large scene.
         median_depth: Depth around which photos are matched, see depth_of_points().
         batch: Photos of a step, one for each rank; each counts as an iteration.
         step_batch: Photos of the last step: `batch`, or fewer if fewer iterations were left.
@@ -96,14 +95,13 @@ class Trainer:
         get_matcher: Callable[[], Matcher] | None = None,
         ranks: Ranks | None = None,
         large_scene: bool | None = None,
-        nearest_points: PointDistances | None = None,
         median_depth: float | None = None,
     ):
         """Prepare a training on the device of the field; create_trainer() does this for a scene and a run folder.
 
         `config` is that after the plan. get_matcher() returns the matcher of the training photos that seeding uses,
-        by default a new one. `ranks` train together. large_scene, nearest_points and median_depth are those of a
-        training that goes on, whose scene may lack points; by default those of the scene.
+        by default a new one. `ranks` train together. large_scene and median_depth are those of a training that goes
+        on, whose scene may lack points; by default those of the scene.
         """
         self.scene, self.config, self.field, self.ranks = scene, config, field, ranks
         self.output: RunOutput | None = None
@@ -116,10 +114,7 @@ class Trainer:
         self.optimizer = make_optimizer(field, config, self.batch)
         pixels = sum(view.camera.pixel_count for view in views)
         self.large_scene = is_large(scene) if large_scene is None else large_scene
-        points = normalized.points[:0] if self.large_scene else normalized.points
-        self.nearest_points = distances_of_points(views, points) if nearest_points is None else nearest_points
-        cameras = TrainingCameras.of_views(views, self.nearest_points, self.device)
-        self.strategy = make_strategy(config, pixels, cameras, large_scene=self.large_scene)
+        self.strategy = make_strategy(config, pixels, large_scene=self.large_scene)
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.sampler = PhotoSampler(len(views), config.seed, rank, self.batch)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)

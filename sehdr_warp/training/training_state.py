@@ -13,7 +13,7 @@ from .optimizer import load_optimizer_tensors, optimizer_tensors
 if TYPE_CHECKING:
     from .trainer import Trainer
 
-_POINT_FACTS = "large_scene", "nearest_points", "median_depth"  # Of points that a training that goes on may lack
+_POINT_FACTS = "large_scene", "median_depth"  # Of points that a training that goes on may lack
 
 
 def state_of(trainer: Trainer) -> Checkpoint:

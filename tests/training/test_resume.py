@@ -58,20 +58,6 @@ def test_a_large_scene_stays_one_in_a_training_that_goes_on_without_its_points(s
     assert [trainer.large_scene for trainer in resumed] == [True, False]
 
 
-def test_the_nearest_points_are_those_of_the_start(scene, tmp_path):
-    """A training that goes on without the points relocates the same floaters."""
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (2000, 3))
-    scene = replace(without_truth(scene), points=points, point_colors=np.full((2000, 3), 0.5, np.float32))
-    before = create_trainer(scene, tmp_path, quick(), device="cpu").nearest_points
-    bare = replace(scene, points=points[:0], point_colors=scene.point_colors[:0])
-    assert np.array(before).max(1).min() > 0
-    assert create_trainer(bare, tmp_path, device="cpu", resume=True).nearest_points == before
-    [file] = tmp_path.glob("checkpoints/*/checkpoint.json")
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"nearest_points": before[1:]}))
-    with pytest.raises(InputError, match=f"has {len(before) - 1} values, and {len(before)} photos"):
-        create_trainer(bare, tmp_path, device="cpu", resume=True)
-
-
 def test_a_training_that_goes_on_without_its_points_is_exact(tmp_path):
     """Its seeds take the depths of the start."""
     bare, config = wall_and_lamp(), quick(**{"densification.cap_max": 900})

@@ -9,7 +9,6 @@ import math
 from ...runs.config import Config
 from .adc import AdcStrategy
 from .base import SEED_STRIDE, MakeSeeds, Schedule, Seeds, Strategy
-from .floaters import PointDistances, TrainingCameras, distances_of_points
 from .mcmc import DENSE, McmcStrategy, mcmc_cap
 
 __all__ = [
@@ -17,19 +16,14 @@ __all__ = [
     "AdcStrategy",
     "MakeSeeds",
     "McmcStrategy",
-    "PointDistances",
     "Seeds",
     "Strategy",
-    "TrainingCameras",
-    "distances_of_points",
     "make_strategy",
     "mcmc_cap",
 ]
 
 
-def make_strategy(
-    config: Config, pixels: int, cameras: TrainingCameras | None = None, *, large_scene: bool = False
-) -> AdcStrategy | McmcStrategy:
+def make_strategy(config: Config, pixels: int, *, large_scene: bool = False) -> AdcStrategy | McmcStrategy:
     """Create the strategy that config.densification.strategy names.
 
     The training photos have `pixels` in all. large_scene: as of scene_facts.is_large().
@@ -45,6 +39,5 @@ def make_strategy(
         prune_opacity,
         options=config.mcmc,
         random_seed=config.seed,
-        cameras=None if cameras is None else cameras.used_by(config.mcmc),
         dense=large_scene and cap > DENSE * math.sqrt(pixels),
     )

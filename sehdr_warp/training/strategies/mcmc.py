@@ -11,7 +11,6 @@ from ...rasterizer.ops.relocation import SampledRows, copy_rows, count_copies, n
 from ...rasterizer.ops.step_updates import add_position_noise
 from ...runs.config import Config, McmcConfig
 from .base import SEED_STRIDE, MakeSeeds, Strategy
-from .floaters import TrainingCameras, floater_mask
 
 MAX_GROWTH = 1.0  # Largest fraction that a refinement adds: as many copies as there are Gaussians
 LEAST_MEAN_OPACITY = 0.03
@@ -51,7 +50,6 @@ class McmcStrategy(Strategy):
 
     options: McmcConfig = field(default_factory=McmcConfig)  # Options of the strategy
     random_seed: int = 0  # Seed of the training
-    cameras: TrainingCameras | None = None  # Before which floaters are relocated; None leaves them
     dense: bool = False  # Whether copies take over the second moments of their source, see reset_moments()
 
     @torch.no_grad()
@@ -68,8 +66,6 @@ class McmcStrategy(Strategy):
         if new_count > 0:  # The only value that the host waits for
             new_count = min(new_count, max(0, int(opacities.sum() / LEAST_MEAN_OPACITY) - count))
         dead = opacities <= self.prune_opacity
-        if self.cameras is not None:
-            dead |= floater_mask(gaussians, self.cameras, self.options)
         slot_of_row, dead_count = number_slots(dead, new_count)
         gaussians.resize(count + new_count, optimizer)
         changed = torch.zeros_like(slot_of_row, dtype=torch.bool)
