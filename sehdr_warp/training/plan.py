@@ -99,8 +99,7 @@ class Plan:
         lines = []
         for row in self.decisions:
             lines.append(f"{row.name:{name}}  {row.choice:{choice}}  {row.reason}")
-            if row.fields:
-                lines.append(f"{'':{name}}  {'':{choice}}  -> {', '.join(_format_fields(row.fields))}")
+            lines += [f"{'':{name}}  {'':{choice}}  -> {line}" for line in _format_fields(row.fields)]
         return "\n".join([*lines, *(f"set by you: {line}" for line in _format_fields(self.user_fields))])
 
     def lines(self) -> list[str]:

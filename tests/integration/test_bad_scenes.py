@@ -56,7 +56,7 @@ def test_folders_without_a_scene(tmp_path, capfd):
         "text": "no photos",
         "file": "not a folder",
         "one": "only photo",
-        "two": "holds 2 photos: depth and light cannot be told apart",
+        "two": "): depth and light cannot be told apart",
         "blender": "has 1 view",
     }.items():
         line = train_refused(capfd, tmp_path / name)

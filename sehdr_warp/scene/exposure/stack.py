@@ -64,7 +64,7 @@ def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
     if len(photos) > MOST_OF_STACK or any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
         return
     try:
-        tracked = track_progress("looking for an exposure stack", photos, log)  # Large PNG and TIFF files take a while.
+        tracked = track_progress("comparing exposures", photos, log)  # Large PNG and TIFF files take a while.
         pictures = sorted((_thumbnail(photo) for _, photo in tracked), key=np.mean)
     except (InputError, *PILLOW_ERRORS):
         return  # The readers of these photos report what is wrong with them.

@@ -32,7 +32,7 @@ LDR_SUFFIXES = (
 HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (
     ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".rw2", ".rwl", ".orf", ".pef", ".srw",
-    ".3fr", ".fff", ".iiq", ".mos", ".mef", ".erf", ".mrw",
+    ".3fr", ".fff", ".iiq", ".mos", ".mef", ".erf", ".mrw", ".dcr", ".kdc", ".k25",
 )  # fmt: skip
 PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512

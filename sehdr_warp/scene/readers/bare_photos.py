@@ -281,7 +281,8 @@ def _require_photos(photos: Sequence[Path], folder: Path, copies: int = 0) -> No
         problem = f"is the only photo{beside}; one view does not show depth"
         raise InputError(photos[0], problem, "add photos from other places")
     if len(photos) < FEWEST_PHOTOS:
-        problem = f"holds {len(photos)} photos{beside}: depth and light cannot be told apart from so few"
+        names = first_names([photo.name for photo in photos], FEWEST_PHOTOS)
+        problem = f"holds {len(photos)} photos ({names}){beside}: depth and light cannot be told apart from so few"
         raise InputError(folder, problem, f"take {FEWEST_PHOTOS} or more from different places, better 20")
 
 

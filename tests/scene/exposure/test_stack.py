@@ -45,7 +45,7 @@ def test_a_stack_from_one_place_is_told_before_it_is_matched(tmp_path, caplog):
     folder = write_photos(tmp_path / "my stack", (8.0, 0.125, 1.0))
     with pytest.raises(InputError) as caught, caplog.at_level("INFO"):
         load_scene(folder)
-    assert "looking for an exposure stack: 3" in caplog.text
+    assert "comparing exposures: 3" in caplog.text
     message = str(caught.value)
     assert "3 photos are an exposure stack from one place (1/8 s to 8 s)" in message
     assert f"`sehdr-warp calibrate '{folder}' --out camera.csv`" in message
