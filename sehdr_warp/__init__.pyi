@@ -12,6 +12,7 @@ from .output.export.splat_edits import SplatEdits
 from .output.film import write_film
 from .output.lighting.environment_map import write_environment_map
 from .output.lighting.lights import write_lights
+from .output.lighting.unit import meter
 from .output.merged_scene import MergedScene, merge_scenes
 from .output.render_views import render_views
 from .output.report.write import write_report
@@ -62,6 +63,7 @@ __all__ = [
     "make_plan",
     "match_points",
     "merge_scenes",
+    "meter",
     "preset_names",
     "rasterize",
     "rasterize_directions",

@@ -70,6 +70,7 @@ assert_type(sw.write_environment_map(splats, "light.exr", inpaint=True), Path)
 assert_type(sw.export(run, "scene.ply", edits=sw.SplatEdits(crop="sphere:0,0,0,1", min_views=2)), Path)
 assert_type(sw.write_scene_page(run, "scene.html"), Path)
 assert_type(sw.write_lights(run, "lights.usda"), list[Path])
+assert_type(sw.meter(run, "r_1", (12, 10), luminance=100.0).luminance, float)
 assert_type(sw.write_orientation(run, up=(0, 0, 1), scale=0.4), Path)
 cameras = [each for _, each in sw.select_cameras(run, "orbit", count=24)]
 assert_type(sw.write_film(run, "orbit.mp4", cameras, transfer="hlg"), Path)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...errors import InputError, SehdrError
+from ...errors import InputError, SehdrError, refuse_paths
 from ...files import read_json, write_json
 from ...runs.values import LIGHT_UNIT_FILE
 from ..cameras.scene_cameras import camera_named
@@ -90,6 +90,7 @@ def meter(
     Raises:
         SehdrError: For a view or place that is not there, or values that cannot be.
     """
+    refuse_paths("load_run", run)
     camera, (x, y) = camera_named(run, view), pixel
     if (luminance is None) == (illuminance is None):
         raise SehdrError("a reading is one of luminance, in cd/m^2, and illuminance, in lux")
