@@ -5,30 +5,9 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch._C._dynamo import guards
 
 from ...kernels import caller_memory as kernels
 from ..warp_launch.launching import launch
-
-_EMPTY = {device: getattr(guards, f"_empty_strided_{device}") for device in ("cpu", "cuda")}
-
-
-class NewTensors:
-    """Makes contiguous float32 tensors, always of the same shapes, in half of the host time of torch.empty_like()."""
-
-    def __init__(self, likes: Sequence[Tensor]) -> None:
-        """Take tensors of these shapes and of one device."""
-        self._device, self._empty = likes[0].device, _EMPTY[likes[0].device.type]
-        contiguous = [torch.empty(like.shape, device="meta") for like in likes]
-        self._layouts = [(tuple(like.shape), like.stride(), torch.float32) for like in contiguous]
-
-    def __call__(self) -> list[Tensor]:
-        """Return new tensors."""
-        tensors = [self._empty(*layout) for layout in self._layouts]
-        if tensors[0].device == self._device:
-            return tensors
-        # torch's fast functions allocate on the current device.
-        return [torch.empty(shape, dtype=dtype, device=self._device) for shape, _, dtype in self._layouts]
 
 
 class CallerMemory:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch._C._dynamo.guards import _reinterpret_tensor  # pyright: ignore[reportAttributeAccessIssue]
 
 from ...kernels.blend_cuda_backward import copy_features_kernel
 from ...kernels.project import projection_kernel
@@ -23,8 +22,8 @@ from ..warp_launch.launching import FixedLaunch, fixed_launch, warp_scalar, warp
 class _View(NamedTuple):
     """Layout of a tensor within a longer one, as as_strided() takes it."""
 
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
+    shape: Sequence[int]
+    strides: Sequence[int]
     begin: int
 
 
@@ -71,7 +70,7 @@ class GradientLayout:
     def _append(self, shape: Sequence[int], strides: Sequence[int]) -> _View:
         begin = -(-self._size // 64) * 64  # A multiple of 64 numbers, where memory of its own could begin.
         self._size = begin + torch.Size(shape).numel()
-        return _View(tuple(shape), tuple(strides), begin)
+        return _View(shape, strides, begin)
 
 
 class CapturedBackward:
@@ -118,8 +117,8 @@ class CapturedBackward:
         """
         if zeros is None:
             zeros = torch.zeros_like(self._layout.like)
-        of_splats = [_reinterpret_tensor(zeros, *view) for view in self._of_splats]
-        of_gaussians = [None if view is None else _reinterpret_tensor(zeros, *view) for view in self._layout.gaussians]
+        of_splats = [zeros.as_strided(*view) for view in self._of_splats]
+        of_gaussians = [None if view is None else zeros.as_strided(*view) for view in self._layout.gaussians]
         return GradientMemory(zeros, of_splats, of_gaussians)
 
     def blend(self, memory: GradientMemory, grad_image: Tensor, grad_transmittance: Tensor | None) -> Sequence[Tensor]:

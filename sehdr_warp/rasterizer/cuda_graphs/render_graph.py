@@ -25,7 +25,7 @@ from ..tile_lists import (
     pack_splats,
 )
 from ..warp_launch.launching import FixedLaunch, fixed_launch, launch, warp_scalar, warp_stream
-from .caller_memory import CallerMemory, NewTensors
+from .caller_memory import CallerMemory
 from .captured_backward import CapturedBackward, GradientLayout, GradientMemory
 from .runner import CudaGraphRunner
 
@@ -97,10 +97,7 @@ class RenderGraph:
         else:
             lists = self._runner.capture(None, lambda: self._list(packed, self._order_and_count(packed)))
             self._fix_launches(splats, packed, lists)
-        self._projection = self._projection_of(splats)
-        others = self._projection if projects else []  # Extents of 2D Gaussians are written to the caller's.
-        zeros = [] if self._gradients is None else [self._gradients]
-        self._new_results = NewTensors([self._image, self._transmittance, *others, *zeros])
+        self._results = [*([self._image, self._transmittance] if self._copies else ()), *self._projection_of(splats)]
         if not self._copies:
             self._inputs, self._to_project = [], None  # The caller's.
 
@@ -164,16 +161,16 @@ class RenderGraph:
         Means2d, depths and extents follow; the extents alone if the graph begins with 2D Gaussians. Call
         count_intersections() before the next replay: the GPU has then read the table of addresses.
 
-        outputs: contiguous, to write the extents to if the graph begins with 2D Gaussians.
+        outputs: contiguous, to write what follows image and transmittance to. By default they are new tensors.
         """
         if self._count.value < 0:  # The last call ended before its count was read, for example by lack of memory.
             self._stream.synchronize()
         self._count.value = -1
         if not self._copies:
             return self._launch(tensors)
-        image, transmittance, *others = self._new_results()
-        zeros = None if self._gradients is None else others.pop()
-        others += outputs
+        new = self._results[: len(self._results) - len(outputs)]
+        image, transmittance, *others = *map(torch.empty_like, new), *outputs
+        zeros = None if self._gradients is None else torch.empty_like(self._gradients)
         # Copies must live until the graph is launched.
         inputs = tensors if self._are_contiguous else [tensor.contiguous() for tensor in tensors]
         self._callers.set(inputs, (image, transmittance, *others), zeros)
@@ -189,9 +186,10 @@ class RenderGraph:
         self._project.launch((), [tensor.data_ptr() for tensor in inputs.without_features], stream)
         self._pack.launch((), (inputs.features.data_ptr(),), stream)
         self._runner.replay()
-        image, transmittance, *others = self._new_results()
+        image, transmittance = torch.empty_like(self._image), torch.empty_like(self._transmittance)
         self._fixed_blend.launch((), (image.data_ptr(), transmittance.data_ptr()), stream)
-        torch._foreach_copy_(others, self._projection)  # pyright: ignore[reportPrivateImportUsage]
+        others = [torch.empty_like(result) for result in self._results]
+        torch._foreach_copy_(others, self._results)  # pyright: ignore[reportPrivateImportUsage]
         return image, transmittance, others, None
 
     def count_intersections(self) -> int:

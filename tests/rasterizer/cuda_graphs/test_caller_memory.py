@@ -5,8 +5,7 @@ import weakref
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.cuda_graphs import caller_memory
-from sehdr_warp.rasterizer.cuda_graphs.caller_memory import CallerMemory, NewTensors
+from sehdr_warp.rasterizer.cuda_graphs.caller_memory import CallerMemory
 
 from ..emulated_graphs import emulate
 
@@ -21,23 +20,6 @@ def without_a_gpu(monkeypatch):
 
 def numbers(*shape):
     return torch.rand(shape, device=DEVICE)
-
-
-@pytest.mark.parametrize("current", ["the same", "another"])
-def test_new_tensors_are_contiguous_and_on_the_device_whatever_the_current_one(current, monkeypatch):
-    if current == "another":
-
-        def elsewhere(shape, strides, dtype):
-            return torch.empty_strided(shape, strides, dtype=dtype, device="meta")
-
-        monkeypatch.setitem(caller_memory._EMPTY, DEVICE.type, elsewhere)
-    likes = numbers(5, 1, 3), numbers(1).expand(20), numbers(4, 3).t(), numbers(0, 2)
-    make = NewTensors(likes)
-    first, second = make(), make()
-    for like, *new in zip(likes, first, second, strict=True):
-        assert all(tensor.shape == like.shape and tensor.is_contiguous() for tensor in new)
-        assert all(tensor.device == DEVICE and tensor.dtype == torch.float32 for tensor in new)
-    assert len({tensor.data_ptr() for tensor in (*first[:3], *second[:3])}) == 6
 
 
 def test_inputs_are_read_and_outputs_written_where_the_caller_has_them():
