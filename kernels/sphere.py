@@ -26,11 +26,12 @@ BLOCK_TILES = 8
 
 
 @cache
-def projection_kernel(dtype, antialiased: bool):
+def projection_kernel(dtype, antialiased: bool, own_positions: bool):
     """Return the kernel that projects Gaussians to caps of the unit sphere, as blend reads them.
 
     footprint: variance in square radians that a training pixel added. smoothing: variance beyond it, for pixels that
     are larger; it keeps a Gaussian's energy by lowering its opacity, as the footprint does where antialiased.
+    own_positions: each Gaussian has a row of position, as of world_to_camera in project.py; otherwise all share one.
     """
     g = geometry(dtype)
     real, vec3, vec4 = g.real, g.vec3, g.vec4
@@ -53,7 +54,7 @@ def projection_kernel(dtype, antialiased: bool):
         if visibility:
             if visibility[i] <= real(0.0):
                 return
-        offset = means[i] - position[0]
+        offset = means[i] - position[i * wp.static(int(own_positions))]
         distance = wp.length(offset)
         usable = distance > near_plane
         n = offset / wp.where(usable, distance, real(1.0))

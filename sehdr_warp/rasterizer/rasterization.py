@@ -132,8 +132,8 @@ def rasterize(
         max_intersections: allocate memory for this many (Gaussian, tile) intersections of a camera, from 1. On a GPU
             the host then never waits for the device, so the call can be part of a CUDA graph. Rendering.overflow tells
             whether there were more.
-        deterministic: on a GPU, sum gradients in a fixed order, so that the same input gives the same bits. Slower, and
-            the gradients of every intersection and of each Gaussian's own camera take memory.
+        deterministic: on a GPU, sum the blend's gradients in a fixed order, as all others are, so that the same input
+            gives the same bits. Slower, and the gradients of every intersection take memory.
 
     Raises:
         TypeError: if an argument is not a tensor or not an integer.

@@ -22,7 +22,7 @@ from .checks import (
 )
 from .gradients import sum_by_gaussian
 from .memory import oom_context
-from .projection import launch_projection
+from .projection import expand_to_gaussians, launch_projection, torch_sums_gradients
 from .tile_lists import EmitOrder, TileLists, check_intersection_count, depth_order, lists_by_tile, tile_grid
 from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch, warp_scalar
@@ -101,7 +101,9 @@ def rasterize_directions(
     with oom_context(means.device, lambda: (len(means), width, height, features.shape[1])):
         gaussians = tuple(tensor.contiguous() for tensor in (means, log_scales, quaternions, opacities, position))
         parameters = near_plane, footprint, smoothing, alpha_threshold
-        kernel = projection_kernel(warp_scalar(means.dtype), antialiased)
+        own_positions = torch_sums_gradients(position)
+        gaussians = expand_to_gaussians(gaussians) if own_positions else gaussians
+        kernel = projection_kernel(warp_scalar(means.dtype), antialiased, own_positions)
         outputs = [means.new_empty(len(means), *shape) for shape in ((4,), (3,), (3,), (), ())]
         splats = _SphereSplats(*launch_projection(kernel, gaussians, parameters, outputs))
         opacities = splats.opacities.masked_fill(~features.isfinite().all(1), 0)

@@ -1,6 +1,7 @@
 """The whole splat against its plain torch reference and against finite differences, on every device."""
 
 import math
+import weakref
 
 import pytest
 import torch
@@ -159,39 +160,60 @@ def test_deterministic_gradients_repeat_bit_for_bit_and_are_the_others(device):
         assert relative_error(ours, other) < 1e-5
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="the CPU is tested with any number of threads")
-@pytest.mark.parametrize("cameras", [1, 2])
-def test_deterministic_gradients_of_cameras_repeat_bit_for_bit_on_a_gpu(cameras):
-    *gaussians, pose, intrinsics = random_scene(count=50_000, width=400, height=400, size=0.02).tensors
-    if cameras > 1:
-        pose, intrinsics = torch.stack([pose] * cameras), torch.stack([intrinsics] * cameras)
-    tensors = [tensor.to("cuda:0", torch.float32).requires_grad_() for tensor in (*gaussians, pose, intrinsics)]
-
-    def gradients():
-        image = rasterize(*tensors, 400, 400, deterministic=True).image
-        return torch.autograd.grad(image, tensors[5:], random_like(image, 3))
-
-    first = gradients()
-    for _ in range(20):
-        assert all(torch.equal(a, b) for a, b in zip(first, gradients(), strict=True))
+ALL = tuple(range(len(NAMES)))
 
 
-@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
-def test_summed_gradients_of_each_gaussians_own_camera_are_the_reference(device, antialiased, monkeypatch):
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize(
+    "count, required, antialiased",
+    [(150, ALL, False), (150, ALL, True), (150, (0, 5), False), (150, (6,), False), (1, ALL, False), (0, ALL, False)],
+)
+def test_summed_gradients_of_each_gaussians_own_camera_are_the_reference(
+    device, count, required, antialiased, deterministic, monkeypatch
+):
     rows, zero_gradients = [], projection.zero_gradients
 
     def watch(tensors, needed):
-        rows[:] = zero_gradients(tensors, needed)
-        return rows
+        gradients = zero_gradients(tensors, needed)
+        rows[:] = [None if each is None else (each.shape, weakref.ref(each)) for each in gradients[4:]]
+        return gradients
 
     monkeypatch.setattr(projection, "adds_in_any_order", lambda device: True)
     monkeypatch.setattr(projection, "zero_gradients", watch)
-    ours, truth = random_scene().to(torch.float64, device), random_scene().to(torch.float64)
-    backward(rasterize(*ours.arguments, antialiased=antialiased, deterministic=True))
+    ours, truth = [random_scene(count, seed=5).to(torch.float64, place) for place in (device, None)]
+    for scene in (ours, truth):
+        for place, tensor in enumerate(scene.tensors):
+            tensor.requires_grad_(place in required)
+    backward(rasterize(*ours.arguments, antialiased=antialiased, deterministic=deterministic))
     backward(rasterize_reference(*truth.arguments, antialiased=antialiased))
-    assert [row.shape for row in rows[4:]] == [(150, 4, 4), (150, 4)]
-    for name, tensor, true in zip(NAMES, ours.tensors, truth.tensors, strict=True):
-        assert relative_error(tensor.grad, true.grad) < 1e-11, name
+    shapes = [(count, 4, 4) if 5 in required else None, (count, 4) if 6 in required else None]
+    assert [row and row[0] for row in rows] == shapes
+    assert not any(row and row[1]() is not None for row in rows)  # Their memory is free again.
+    for place in required:
+        mine, true = ours.tensors[place].grad, truth.tensors[place].grad
+        assert mine.shape == true.shape and bool(true.any()) == (count > 0)
+        assert relative_error(mine, true) < 1e-11, NAMES[place]
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_without_gradients_of_the_camera_all_gaussians_share_one(device, deterministic, monkeypatch):
+    kernels, projection_kernel = [], projection.projection_kernel
+
+    def watch(*kind):
+        kernels.append(kind[-1])
+        return projection_kernel(*kind)
+
+    monkeypatch.setattr(projection, "adds_in_any_order", lambda device: True)
+    monkeypatch.setattr(projection, "projection_kernel", watch)
+    scene = random_scene().to(torch.float64, device)  # Which no CUDA graph replays.
+    with torch.no_grad():
+        rasterize(*scene.arguments, deterministic=deterministic)
+    for tensor in scene.tensors[5:]:
+        tensor.requires_grad_(False)
+    backward(rasterize(*scene.arguments, deterministic=deterministic))
+    assert kernels == [False, False]
+    rasterize(*scene.tensors[:5], scene.tensors[5], scene.tensors[6].requires_grad_(), scene.width, scene.height)
+    assert kernels == [False, False, True]
 
 
 def test_a_rendering_prints_in_one_line():

@@ -1,10 +1,13 @@
-"""Caps of tiles; what pictures of the sphere show is compared in tests/kernels."""
+"""Caps of tiles and gradients of the position; what pictures of the sphere show is compared in tests/kernels."""
 
+import pytest
 import torch
 
+from sehdr_warp.rasterizer import projection, rasterize_directions
 from sehdr_warp.rasterizer.sphere import caps_of
 
-from ..kernels.test_sphere import latlong
+from ..kernels.test_sphere import FOCAL, gaussians, latlong
+from .scenes import random_like, relative_error
 
 
 def test_caps_hold_their_directions():
@@ -15,3 +18,33 @@ def test_caps_hold_their_directions():
         for y, x in ((0, 0), (24, 49), (13, 31)):
             cap = caps[(y // side) * columns + x // side]
             assert float(torch.dot(cap[:3], directions[y, x]).clamp(-1, 1).acos()) <= float(cap[3]) + 1e-9
+
+
+@pytest.mark.parametrize("count", [0, 1, 300])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_summed_gradients_of_each_gaussians_own_position_are_those_of_a_shared_one(
+    device, count, antialiased, monkeypatch
+):
+    scene, directions = gaussians(count, device=device), latlong(device=device)
+    tensors = [tensor.requires_grad_() for tensor in (*scene, torch.tensor([0.3, -0.2, 0.1], device=device).double())]
+
+    def gradients():
+        image, left = rasterize_directions(*tensors, directions, focal_length=FOCAL, antialiased=antialiased)
+        return torch.autograd.grad((image * random_like(image, 1)).sum() + left.square().sum(), tensors)
+
+    rows, zero_gradients = [], projection.zero_gradients
+
+    def watch(tensors, needed):
+        gradients = zero_gradients(tensors, needed)
+        rows.append(gradients[4].shape)
+        return gradients
+
+    monkeypatch.setattr(projection, "zero_gradients", watch)
+    pair = []
+    for in_any_order in (False, True):
+        monkeypatch.setattr(projection, "adds_in_any_order", lambda device, answer=in_any_order: answer)
+        pair.append(gradients())
+    assert rows == [(3,), (count, 3)]
+    for mine, true in zip(*pair, strict=True):
+        assert mine.shape == true.shape and bool(true.any()) == (count > 0)
+        assert relative_error(mine, true) < 1e-11
