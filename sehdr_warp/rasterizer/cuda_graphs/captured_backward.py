@@ -14,7 +14,7 @@ from torch import Tensor
 from ...kernels.blend_cuda_backward import copy_features_kernel
 from ...kernels.project import projection_kernel
 from ..blending_cuda import BlockBackward
-from ..projection import ProjectedGaussians, adjoint_arguments, projection_parameters
+from ..projection import ProjectedGaussians, adjoint_arguments, expand_to_gaussians, projection_parameters
 from ..render_options import RenderOptions
 from ..warp_launch.launching import FixedLaunch, fixed_launch, warp_scalar, warp_stream
 
@@ -34,7 +34,7 @@ class GradientMemory:
     of_splats: of features and means2d; if the CUDA graph begins with 2D Gaussians, of features, conics, means2d and
     opacities. Emptied when they are returned, because torch takes a leaf's gradient without a copy only if nothing else
     refers to it.
-    of_gaussians: of the projection's inputs, None where not needed.
+    of_gaussians: of the projection's inputs but the camera, None where not needed.
     """
 
     zeros: Tensor
@@ -51,6 +51,8 @@ class GradientLayout:
     gaussians: inputs of the projection, None where no gradient is needed; none if the graph begins with 2D Gaussians.
     copies_features: add a contiguous gradient of features, which torch can use as a leaf's without a copy.
     like: a tensor of the shape of all of it that takes no memory, for torch.empty_like().
+    own_cameras: shapes of the gradients of pose and intrinsics for each Gaussian, None where not needed. Not part of
+    it: a million Gaussians take 80 MB, from CapturedBackward.project() alone.
     """
 
     def __init__(self, blend: BlockBackward, gaussians: Sequence[Tensor | None], *, copies_features: bool) -> None:
@@ -64,7 +66,9 @@ class GradientLayout:
         self.copies_features = copies_features
         if copies_features:
             self.features = self._append(self.features.shape, (channels, 1))
+        *gaussians, pose, intrinsics = gaussians or (None, None)
         self.gaussians = [None if like is None else self._append(like.shape, like.stride()) for like in gaussians]
+        self.own_cameras = [None if like is None else (count, *like.shape) for like in (pose, intrinsics)]
         self.like = blend.transmittance.new_empty(1).expand(self._size)
 
     def _append(self, shape: Sequence[int], strides: Sequence[int]) -> _View:
@@ -139,9 +143,12 @@ class CapturedBackward:
         memory: of the blend's backward pass, or if the image has no gradient, a new one.
         """
         begin = memory.zeros.data_ptr()
+        shapes = self._layout.own_cameras
+        own_cameras = [None if shape is None else memory.zeros.new_zeros(shape) for shape in shapes]
         addresses = [begin + offset for offset in self._projection_offsets]
+        addresses += [rows.data_ptr() for rows in own_cameras if rows is not None]
         self._project.launch((grad_means2d, grad_depths), addresses, self._stream)
-        return memory.of_gaussians
+        return *memory.of_gaussians, *(None if rows is None else rows.sum(0) for rows in own_cameras)
 
 
 def _fixed_projection_backward(
@@ -157,9 +164,11 @@ def _fixed_projection_backward(
     """
     grad_means2d, grad_depths = torch.empty_like(projected.means2d), torch.empty_like(projected.depths)
     grad_conics, grad_opacities = rows.as_strided(*layout.conics), rows.as_strided(*layout.opacities)
-    pairs = zip(gaussians, layout.gaussians, strict=True)
-    results = [None if view is None else torch.empty_like(tensor) for tensor, view in pairs]
-    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased, False, False)
+    shapes = *(None if view is None else view.shape for view in layout.gaussians), *layout.own_cameras
+    results = [None if shape is None else rows.new_empty(shape) for shape in shapes]
+    own_cameras = any(layout.own_cameras)
+    gaussians = expand_to_gaussians(gaussians) if own_cameras else gaussians
+    kernel = projection_kernel(warp_scalar(projected.depths.dtype), options.antialiased, False, own_cameras)
     upstream = grad_means2d, grad_conics, grad_depths, grad_opacities, None
     parameters = projection_parameters(options)
     arguments, gradients = adjoint_arguments(gaussians, parameters, projected.extents, upstream, results)

@@ -1,13 +1,16 @@
 """Backward passes of renders that CUDA graphs made."""
 
+import weakref
+
 import pytest
 import torch
 
 from sehdr_warp.rasterizer import rasterize
-from sehdr_warp.rasterizer.cuda_graphs import cache, captured_backward
+from sehdr_warp.rasterizer.cuda_graphs import cache, captured_backward, render_graph
+from sehdr_warp.rasterizer.reference import rasterize_reference
 
-from ..repeated_calls import CALLS, assert_alike, launched, recordings, scene_of
-from ..scenes import random_like
+from ..repeated_calls import CALLS, DEVICE, assert_alike, launched, recordings, scene_of
+from ..scenes import random_like, random_scene, relative_error
 
 pytestmark = pytest.mark.usefixtures("no_graphs")
 
@@ -34,14 +37,18 @@ def test_pictures_stay_and_backward_passes_come_in_any_order():
 @pytest.mark.parametrize("one_sort", [1 << 18, 0])
 def test_a_retained_graph_has_the_gradients_of_each_part_in_any_order(one_sort, monkeypatch):
     monkeypatch.setattr(cache, "MAX_SINGLE_SORT", one_sort)
-    scene = scene_of()
-    replayed, truth = [rasterize(*scene.arguments) for _ in range(CALLS)][-1], launched(*scene.arguments)
-    assert recordings()
+    scene, replayed = scene_of(), None
+    for _ in range(CALLS):
+        del replayed  # Its graph is the next one's: of many Gaussians there is only one.
+        replayed = rasterize(*scene.arguments)
+    truth = launched(*scene.arguments)
+    assert recordings() == 1 and not any(pool.idle for pool in cache.pools.values())
     parts = [
         (lambda drawing: (drawing.image * random_like(drawing.image, 1)).sum(), scene.tensors[:5]),
         (lambda drawing: (drawing.image * random_like(drawing.image, 2)).sum(), scene.tensors[4:5]),
-        (lambda drawing: drawing.depths.sum(), scene.tensors[:1]),
+        (lambda drawing: drawing.depths.sum(), scene.tensors[::5]),
         (lambda drawing: drawing.image.square().sum() + drawing.depths.sum(), scene.tensors[:4]),
+        (lambda drawing: drawing.image.sum() + drawing.means2d.square().sum(), scene.tensors[5:]),
     ]
     for loss, leaves in parts + parts[::-1]:
         pair = [torch.autograd.grad(loss(drawing), leaves, retain_graph=True) for drawing in (replayed, truth)]
@@ -140,3 +147,75 @@ def test_gradients_that_are_not_of_the_image_alone_reach_the_gaussians(change):
     replayed = [gradients(rasterize) for _ in range(CALLS)]
     assert recordings()
     assert_alike(replayed[-1], gradients(launched))
+
+
+@pytest.mark.parametrize("required", [(5, 6), (5,), (6,), (0, 5), (0,)])
+@pytest.mark.parametrize("count, few", [(80, 1 << 18), (80, 0), (1, 1 << 18)])
+def test_gradients_of_the_camera_are_the_references_each_time(count, few, required, monkeypatch):
+    monkeypatch.setattr(render_graph, "MAX_COPIED_GAUSSIANS", few)
+    scene = random_scene(count, seed=5).to(torch.float32, DEVICE)
+    rows, new_zeros = [], torch.Tensor.new_zeros
+
+    def watch(tensor, *shape, **options):
+        zeros = new_zeros(tensor, *shape, **options)
+        if zeros.shape in ((count, 4, 4), (count, 4)):
+            rows.append(weakref.ref(zeros))
+        return zeros
+
+    for place, tensor in enumerate(scene.tensors):
+        tensor.requires_grad_(place in required)
+    leaves = [scene.tensors[place] for place in required]
+    truth = scene.to(torch.float64, "cpu")
+    image = [rasterize(*scene.arguments).image for _ in range(CALLS)][-1]
+    assert recordings()
+    monkeypatch.setattr(torch.Tensor, "new_zeros", watch)  # Which the CPU's launched calls do not use.
+    gradients = [torch.autograd.grad(image, leaves, random_like(image, 3), retain_graph=True) for _ in range(3)]
+    true_image = rasterize_reference(*truth.arguments).image
+    true = torch.autograd.grad(true_image, [truth.tensors[place] for place in required], random_like(true_image, 3))
+    for each in gradients:
+        for mine, right in zip(each, true, strict=True):
+            assert mine.shape == right.shape and mine.is_contiguous() and right.any()
+            assert relative_error(mine, right) < 1e-4
+    assert len({tensor.data_ptr() for each in gradients for tensor in each}) == 3 * len(required)
+    assert len(rows) == 3 * len({5, 6} & {*required}) and not any(row() is not None for row in rows)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="the CPU is tested with any number of threads")
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("way", ["launched", "replayed", "deterministic"])
+def test_gradients_of_cameras_repeat_bit_for_bit_on_a_gpu(way, cameras):
+    *gaussians, pose, intrinsics = random_scene(count=50_000, width=400, height=400, size=0.02).tensors
+    if cameras > 1:
+        pose, intrinsics = torch.stack([pose] * cameras), torch.stack([intrinsics] * cameras)
+    tensors = [tensor.to("cuda:0", torch.float32).requires_grad_() for tensor in (*gaussians, pose, intrinsics)]
+    options = {"launched": {"max_intersections": 10_000_000}, "deterministic": {"deterministic": True}}.get(way, {})
+
+    def gradients():
+        drawing = rasterize(*tensors, 400, 400, **options)
+        # Those of the image go through the blend's, whose last bits differ unless deterministic.
+        result = drawing.image if way == "deterministic" else drawing.means2d
+        return torch.autograd.grad(result, tensors[5:], random_like(result, 3))
+
+    for _ in range(CALLS):
+        gradients()
+    assert bool(recordings()) == (way == "replayed")
+    first = gradients()
+    for _ in range(20):
+        assert all(torch.equal(a, b) for a, b in zip(first, gradients(), strict=True))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="memory of a GPU")
+@pytest.mark.parametrize("way", ["launched", "replayed"])
+def test_memory_of_each_gaussians_own_camera_is_free_after_a_backward_pass(way):
+    count = 300_000
+    scene = random_scene(count=count, size=0.01).to(torch.float32, "cuda:0")
+    draw = rasterize if way == "replayed" else launched
+    for place, tensor in enumerate(scene.tensors):
+        tensor.requires_grad_(place > 4)
+    for _ in range(CALLS):
+        torch.autograd.grad(draw(*scene.arguments).image.sum(), scene.tensors[5:])
+    assert bool(recordings()) == (way == "replayed")
+    image = draw(*scene.arguments).image
+    before = torch.cuda.memory_allocated()
+    torch.autograd.grad(image.sum(), scene.tensors[5:], retain_graph=True)
+    assert torch.cuda.memory_allocated() - before < 1 << 20
