@@ -1,5 +1,6 @@
 """Folders of runs that earlier versions wrote, which are stored in tests/data."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -33,11 +34,17 @@ def test_a_run_of_version_0_3_renders_exports_and_resumes(tmp_path):
     assert (run / "checkpoints" / "iteration_00000024").is_dir()
 
 
-def test_a_run_trained_by_a_field_that_is_gone_is_read_with_one_warning(tmp_path, caplog):
+FIELDS = ["loss.clipped_lift", "mcmc.prune_near_points", "mcmc.prune_near_angle", "densification.prune_angle"]
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_a_run_trained_by_a_field_that_is_gone_is_read_with_one_warning(tmp_path, caplog, field):
     """Its config.json cannot be edited, because the checkpoint states the hash of that file."""
     run = shutil.copytree(DATA / "run-0.3", tmp_path / "run")
-    config, file = RunFolder(run).read_config(), run / "config.json"
-    file.write_text(file.read_text().replace('"prune_near_angle": 0.0', '"prune_near_angle": 0.1'))
+    config, file, (table, name) = RunFolder(run).read_config(), run / "config.json", field.split(".")
+    values = json.loads(file.read_text())
+    values[table][name] = 0.5
+    file.write_text(json.dumps(values))
     assert RunFolder(run).read_config() == RunFolder(run).read_config() == config
     (warning,) = caplog.messages
-    assert warning.startswith(f"{file}: mcmc.prune_near_angle = 0.1 is of an earlier version and gone")
+    assert warning.startswith(f"{file}: {field} = 0.5 is of an earlier version and gone")

@@ -111,6 +111,8 @@ def test_only_the_newest_are_kept(folder):
         folder.write_checkpoint(*state(iteration), keep=2)
     assert sorted(p.name for p in folder.checkpoints.iterdir()) == ["iteration_00000010", "iteration_00000100"]
     assert folder.newest_checkpoint().values["iteration"] == 100
+    folder.write_checkpoint(*state(50), keep=2)  # As by a training that goes on before a damaged one
+    assert sorted(p.name for p in folder.checkpoints.iterdir()) == ["iteration_00000010", "iteration_00000050"]
 
 
 def test_what_a_killed_writer_left_is_no_checkpoint(folder):

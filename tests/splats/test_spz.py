@@ -39,6 +39,21 @@ def test_versions_of_other_programs_are_one_scene(shared):
         np.testing.assert_array_equal(getattr(newest, field), getattr(before, field))
 
 
+def test_version_2_turns_gaussians_by_three_bytes(tmp_path):
+    """Niantic's README: x, y and z of a unit quaternion whose w is positive, in axes of y up and z back."""
+    write_gaussians(tmp_path / "3.spz", natural(degree=0))
+    written = read_gaussians(tmp_path / "3.spz")
+    plain = gzip.decompress((tmp_path / "3.spz").read_bytes())
+    turns = written.transformed(np.diag([1.0, -1.0, -1.0, 1.0])).unit_quaternions
+    packed = np.rint((turns[:, 1:] * np.where(turns[:, :1] < 0, -1, 1) + 1) * 127.5).astype(np.uint8)
+    end = 16 + written.count * (9 + 1 + 3 + 3)
+    (tmp_path / "2.spz").write_bytes(gzip.compress(plain[:4] + struct.pack("<I", 2) + plain[8:end] + packed.tobytes()))
+    read = read_gaussians(tmp_path / "2.spz")
+    cosines = (read.unit_quaternions * written.unit_quaternions).sum(axis=1)
+    assert (np.abs(cosines) > 0.99).all()
+    np.testing.assert_array_equal(read.means, written.means)
+
+
 @pytest.mark.parametrize("degree", [0, 3])
 def test_version_4_of_spz_holds_what_version_3_does(tmp_path, degree, caplog):
     write_gaussians(tmp_path / "3.spz", natural(degree=degree))

@@ -116,8 +116,34 @@ def test_the_end_of_the_server_ends_a_save(serve):
     server.shutdown()
     started = time.monotonic()
     server.server_close()
-    assert time.monotonic() - started < 10 and run.renders < 1000
+    ended, renders = time.monotonic(), run.renders
+    assert ended - started < 10 and renders < 1000
+    time.sleep(0.2)
+    assert run.renders == renders
     client.close()
+
+
+def test_room_is_reserved_until_the_end_of_an_answer(monkeypatch):
+    monkeypatch.setattr(connections, "MOST_BYTES", 100)
+    monkeypatch.setattr(connections, "_ROOM_WAIT", 0.1)
+    both, (first, second) = connections.Connections(), socket.socketpair()
+    with first, second:
+        assert both.add(first) and both.add(second)
+        with both.answering(both.of(first)):
+            both.reserve(both.of(first), 60)
+            with pytest.raises(connections.BusyError):
+                both.reserve(both.of(second), 60)
+        both.reserve(both.of(second), 60)
+
+
+def test_connections_that_are_answered_are_not_closed_for_others(monkeypatch):
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 1)
+    few, (first, second) = connections.Connections(), socket.socketpair()
+    with first, second:
+        assert few.add(first)
+        with few.answering(few.of(first)):
+            assert not few.add(second) and few.of(first)
+        assert few.add(second)
 
 
 def test_a_save_that_would_fill_the_disk_is_refused(serve):

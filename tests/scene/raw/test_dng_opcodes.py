@@ -83,11 +83,13 @@ def test_opcodes_that_change_values(tmp_path):
     size = (HEIGHT, WIDTH)
     rows = np.linspace(0.5, 1.5, HEIGHT)
     listed = struct.pack(">I", HEIGHT) + rows.astype(">f4").tobytes()
-    polynomial = area(size) + struct.pack(">I2d", 1, 0.05, 0.8)
+    degree_1 = struct.pack(">I2d", 1, 0.05, 0.8)
+    even_columns = struct.pack(">8I", 0, 0, *size, 0, 1, 1, 2)
     cases = {
         "scale by row": (12, area(size) + listed, lambda v: v / rows[:, None]),
         "delta by row": (10, area(size) + listed, lambda v: v - rows[:, None] + 1),
-        "polynomial": (8, polynomial, lambda v: (v - 0.05) / 0.8),
+        "polynomial": (8, area(size) + degree_1, lambda v: (v - 0.05) / 0.8),
+        "polynomial of even columns": (8, even_columns + degree_1, lambda v: np.where(X % 2, v, (v - 0.05) / 0.8)),
     }
     for name, (number, body, inverse) in cases.items():
         expected = EVEN + (1 if name == "delta by row" else 0)

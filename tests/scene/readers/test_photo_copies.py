@@ -74,6 +74,16 @@ def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):
     assert note.startswith("3 photos are copies of others and left out: img_0.JPG of IMG_0.png")
 
 
+def test_a_photo_of_the_same_name_that_shows_a_little_more_of_one_side_is_no_copy(tmp_path):
+    for i in range(4):
+        picture = pattern(98, 64, i)
+        Image.fromarray(picture[:, :96]).save(tmp_path / f"IMG_{i}.png")
+        Image.fromarray(picture[:, 2 * (i > 0) :][:, :96]).save(tmp_path / f"IMG_{i}.jpg")
+    dataset = find_photos(tmp_path)
+    assert len(dataset.records) == 7
+    assert dataset.notes == ("1 photo is a copy of others and left out: IMG_0.jpg of IMG_0.png",)
+
+
 def test_copies_of_the_same_bytes_are_left_out_and_named(tmp_path):
     for i in range(4):
         Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")

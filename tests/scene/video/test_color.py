@@ -25,6 +25,7 @@ pytest.importorskip("av")
     (True, (2, 9, 9), {"comment": "Apple Log"}, "Apple Log Profile", "colour:Apple Log Profile"),
     (False, (1, 1, 1), {"comment": "S-Log3"}, "S-Log3", "colour:S-Log3"),
     (True, (1, 1, 1), {}, "Rec.709", None),
+    (True, (2, 1, 1), {}, "no curve", None),
 ])  # fmt: skip
 def test_ten_bits_and_the_curve_that_a_stream_states(tmp_path, tags, metadata, curve, response, full):
     file, frames = tmp_path / "a.mov", still()

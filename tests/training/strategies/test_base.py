@@ -21,6 +21,12 @@ def test_a_training_of_any_length_reaches_its_budget(iterations):
     assert count == 120_000
 
 
+def test_a_refinement_at_most_doubles_the_count():
+    strategy = make_strategy(load_config("default"), 10**6)
+    last = max(iteration for iteration in range(1, 30_001) if strategy.is_due(iteration))
+    assert strategy.next_count(last, 5000) == 10_000 and strategy.next_count(last, 100_000) == strategy.cap_max
+
+
 @pytest.mark.parametrize("photos", [1, 2, 3, 8])
 def test_each_change_happens_once_whatever_the_stride(photos):
     strategy = make_strategy(VARIANTS["default"], 1000)
