@@ -163,12 +163,17 @@ def test_turned_photos_are_placed_upright(tmp_path, shared):
 
 
 def test_photos_of_several_cameras_get_their_own_lenses(tmp_path, shared):
+    """Photos of other sizes, and those of other devices."""
     photos = sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]
+    tags = Image.Exif()
+    tags[0x0110] = "another"
     for i, photo in enumerate(photos):
         with Image.open(photo) as image:
-            image.reduce(5 if i < 3 else 6).save(tmp_path / photo.name, quality=95)
+            image.reduce(5 if i < 3 else 6).save(tmp_path / photo.name, quality=95, exif=tags if i < 1 else b"")
     reconstruction = reconstruct(sorted(tmp_path.glob("*.JPG")), tmp_path / "cache")
-    assert {(image.lens.width, image.lens.height) for image in reconstruction.model.images} == {(472, 355), (567, 426)}
+    lenses = [image.lens for image in reconstruction.model.images]
+    assert {(lens.width, lens.height) for lens in lenses} == {(472, 355), (567, 426)}
+    assert len({lens.params[0] for lens in lenses}) == 3
     assert 0 < reconstruction.error < MOST_ERROR and not reconstruction.notes(photos)
 
 
