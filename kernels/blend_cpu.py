@@ -26,6 +26,7 @@ results do not depend on the number of threads.
 """
 
 from functools import cache
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -42,9 +43,19 @@ EXP_COEFFICIENTS = (
 )
 
 
+class RowFunctions(NamedTuple):
+    """Type of a row of LANES pixels, and Warp functions of such rows."""
+
+    row: Any
+    broadcast: Any  # A row of one value
+    heaviside: Any  # 1 where a value is positive, else 0
+    exponential: Any  # exp() of values that are not positive
+    reached_halves: Any  # First half of a tile that a Gaussian reaches, and one past the last
+
+
 @cache
-def row_functions(dtype, exp_squarings: int):
-    """Return the type of a row of pixels and functions: broadcast, heaviside, exponential, reached halves of a tile.
+def row_functions(dtype, exp_squarings: int) -> RowFunctions:
+    """Return what both kernels do with rows of pixels.
 
     float64, the reference, uses the library's exponential. exp_squarings: the polynomial is evaluated at
     p / 2^exp_squarings and squared as often, so that p may go down to -0.7 * 2^exp_squarings.
@@ -100,7 +111,7 @@ def row_functions(dtype, exp_squarings: int):
             reached = wp.vec2i(int(first), int(wp.floor(last)) + 1)
         return reached
 
-    return row, broadcast, heaviside, exponential, reached_halves
+    return RowFunctions(row, broadcast, heaviside, exponential, reached_halves)
 
 
 def _options(dtype) -> dict:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,13 @@ MOST_VIEWS = 64  # Largest number of photos whose codes are read; cameras are re
 LOWEST_PLATEAU = 200  # Lowest code, of 255, that photos clip at below white, as after an edit
 PLATEAU_CODES = 3  # Brightest codes that occur, over which JPEG spreads the clipped pixels
 PLATEAU_SHARE, PLATEAU_EXCESS = 1e-3, 3.0  # Least part of the pixels that they hold, and multiple of the codes below
+
+
+class PointFacts(NamedTuple):
+    """Figures of a scene's points that a training uses; None where they are to be measured."""
+
+    large_scene: bool | None = None  # Whether photos show little of the scene, see is_large()
+    median_depth: float | None = None  # Depth around which photos are matched, see initialization.depth_of_points()
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from .plan import check_fields, make_plan
 from .process_settings import summary_writer
 from .ranks import Ranks
 from .run_output import RunOutput
+from .scene_facts import PointFacts
 from .seeding import brighten_clipped
 from .trainer import Trainer, sizes_of
 from .training_state import load_state, point_facts_of, state_of
@@ -163,7 +164,9 @@ def _new_trainer(
     # One matcher for compensation, initial points and seeds; made when it is needed, because it takes long.
     get_matcher = cache(lambda: matcher or make_matcher(normalized_photos, response, device, depth))
     field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
-    trainer = Trainer(photos, config, field, get_matcher=get_matcher, ranks=ranks, median_depth=depth)
+    trainer = Trainer(
+        photos, config, field, get_matcher=get_matcher, ranks=ranks, point_facts=PointFacts(median_depth=depth)
+    )
     light = trainer.data_manager.clipped_light_targets  # Estimated once, for this and for the loss.
     if light is not None and not config.model.init_file:
         brighten_clipped(field, normalized_photos.train_views, light)
@@ -196,7 +199,7 @@ def _resumed_trainer(
     scene = scene if compensation is None else compensation.normalize_photos(scene, field.response)
     finished_at = before if checkpoint.values["iteration"] >= before else folder.finished_at()
     longer = config.continued_after(finished_at)
-    trainer = Trainer(scene, longer, field, ranks=ranks, **point_facts_of(checkpoint))
+    trainer = Trainer(scene, longer, field, ranks=ranks, point_facts=point_facts_of(checkpoint))
     try:
         load_state(trainer, checkpoint)
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:

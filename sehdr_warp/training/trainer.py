@@ -42,7 +42,7 @@ from .optimizer import make_optimizer, means_rate, set_means_rate
 from .process_settings import interruptible, torch_settings
 from .ranks import END, GO, WAIT, Ranks
 from .run_output import RunOutput
-from .scene_facts import is_large
+from .scene_facts import PointFacts, is_large
 from .seeding import make_seeds
 from .step_runner import StepRunner
 from .strategies import SEED_STRIDE, Seeds, make_strategy
@@ -94,14 +94,13 @@ class Trainer:
         *,
         get_matcher: Callable[[], Matcher] | None = None,
         ranks: Ranks | None = None,
-        large_scene: bool | None = None,
-        median_depth: float | None = None,
+        point_facts: PointFacts = PointFacts(),
     ):
         """Prepare a training on the device of the field; create_trainer() does this for a scene and a run folder.
 
         `config` is that after the plan. get_matcher() returns the matcher of the training photos that seeding uses,
-        by default a new one. `ranks` train together. large_scene and median_depth are those of a training that goes
-        on, whose scene may lack points; by default those of the scene.
+        by default a new one. `ranks` train together. point_facts are those of a training that goes on, whose
+        scene may lack points; by default those of the scene.
         """
         self.scene, self.config, self.field, self.ranks = scene, config, field, ranks
         self.output: RunOutput | None = None
@@ -113,7 +112,7 @@ class Trainer:
         views = normalized.train_views
         self.optimizer = make_optimizer(field, config, self.batch)
         pixels = sum(view.camera.pixel_count for view in views)
-        self.large_scene = is_large(scene) if large_scene is None else large_scene
+        self.large_scene = is_large(scene) if point_facts.large_scene is None else point_facts.large_scene
         self.strategy = make_strategy(config, pixels, large_scene=self.large_scene)
         self.average = MovingAverage(config, self.strategy.schedule.stop)
         self.sampler = PhotoSampler(len(views), config.seed, rank, self.batch)
@@ -124,7 +123,8 @@ class Trainer:
             problem = f"view {wide.name} is {wide.camera.projection}, for which densification.strategy = 'adc' has no "
             raise InputError(scene.name, f"{problem}projected centers", "use densification.strategy=mcmc")
         self._can_seed = wide is None
-        self.median_depth = depth_of_points(normalized) if median_depth is None else median_depth
+        depth = point_facts.median_depth
+        self.median_depth = depth_of_points(normalized) if depth is None else depth
         own_matcher = cache(partial(make_matcher, normalized, field.response, self.device, self.median_depth))
         self._get_matcher: Callable[[], Matcher] | None = get_matcher or own_matcher  # None after the last refinement
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from ..runs.checkpoint import Checkpoint, part_of
 from .gradient_step import OVERFLOWED, SKIPPED
 from .optimizer import load_optimizer_tensors, optimizer_tensors
+from .scene_facts import PointFacts
 
 if TYPE_CHECKING:
     from .trainer import Trainer
-
-_POINT_FACTS = "large_scene", "median_depth"  # Of points that a training that goes on may lack
 
 
 def state_of(trainer: Trainer) -> Checkpoint:
@@ -32,13 +31,13 @@ def state_of(trainer: Trainer) -> Checkpoint:
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
     values = {"iteration": trainer.iteration, "seconds": trainer.seconds, "order": remaining}
     values |= {"skipped_steps": trainer.skipped_steps, "overflowed_steps": trainer.overflowed_steps}
-    values |= {name: getattr(trainer, name) for name in _POINT_FACTS}
+    values |= {name: getattr(trainer, name) for name in PointFacts._fields}
     return Checkpoint(tensors, values)
 
 
-def point_facts_of(state: Checkpoint) -> dict[str, Any]:
-    """Return arguments of Trainer() for a training that continues from a state; of an earlier version some are None."""
-    return {name: state.values.get(name) for name in _POINT_FACTS}
+def point_facts_of(state: Checkpoint) -> PointFacts:
+    """Return the figures of points in a state; of an earlier version some are None."""
+    return PointFacts(*(state.values.get(name) for name in PointFacts._fields))
 
 
 def load_state(trainer: Trainer, state: Checkpoint) -> None:

@@ -78,7 +78,7 @@ def train_as_worker(ranks: Ranks, path: str | None = None) -> Trainer:
         ranks.share_photos(scene, _bytes_of(scene))
     else:
         scene = ranks.receive_photos()
-    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks, **point_facts_of(checkpoint))
+    trainer = Trainer(scene, config, field.to(ranks.device), ranks=ranks, point_facts=point_facts_of(checkpoint))
     load_state(trainer, checkpoint)
     del message, checkpoint, tensors
     for _ in trainer:

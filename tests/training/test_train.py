@@ -13,6 +13,7 @@ from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.run_output import evaluate_views
+from sehdr_warp.training.scene_facts import PointFacts
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 
@@ -159,7 +160,7 @@ def test_new_gaussians_of_a_large_scene_do_not_fade_before_a_photo_shows_them(sc
 def test_gaussians_that_no_photo_shows_shrink_but_in_a_large_scene(scene, device, large):
     config = quick(length=60, **{"loss.size_weight": 0.01})
     field = make_field(scene, config, response_for_training(scene, config), device)
-    trainer = Trainer(scene, config, field, large_scene=large)
+    trainer = Trainer(scene, config, field, point_facts=PointFacts(large_scene=large))
     gaussians = trainer.field.gaussians
     added = gaussians.rows(torch.arange(3, device=device))
     added["means"] = added["means"] + 1e3  # Out of view of all cameras.
