@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sehdr_warp.rasterizer import projection, rasterize_directions
+from sehdr_warp.rasterizer import projection, rasterize_directions, sphere
 from sehdr_warp.rasterizer.sphere import caps_of
 
 from ..kernels.test_sphere import FOCAL, gaussians, latlong
@@ -33,18 +33,24 @@ def test_summed_gradients_of_each_gaussians_own_position_are_those_of_a_shared_o
         return torch.autograd.grad((image * random_like(image, 1)).sum() + left.square().sum(), tensors)
 
     rows, zero_gradients = [], projection.zero_gradients
+    kernels, projection_kernel = [], sphere.projection_kernel
 
     def watch(tensors, needed):
         gradients = zero_gradients(tensors, needed)
         rows.append(gradients[4].shape)
         return gradients
 
+    def watch_kernel(*kind):
+        kernels.append(kind[-1])
+        return projection_kernel(*kind)
+
     monkeypatch.setattr(projection, "zero_gradients", watch)
+    monkeypatch.setattr(sphere, "projection_kernel", watch_kernel)
     pair = []
     for in_any_order in (False, True):
         monkeypatch.setattr(projection, "adds_in_any_order", lambda device, answer=in_any_order: answer)
         pair.append(gradients())
-    assert rows == [(3,), (count, 3)]
+    assert rows == [(3,), (count, 3)] and kernels == [False, True]
     for mine, true in zip(*pair, strict=True):
         assert mine.shape == true.shape and bool(true.any()) == (count > 0)
         assert relative_error(mine, true) < 1e-11

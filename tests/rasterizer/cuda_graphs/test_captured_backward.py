@@ -155,6 +155,7 @@ def test_gradients_of_the_camera_are_the_references_each_time(count, few, requir
     monkeypatch.setattr(render_graph, "MAX_COPIED_GAUSSIANS", few)
     scene = random_scene(count, seed=5).to(torch.float32, DEVICE)
     rows, new_zeros = [], torch.Tensor.new_zeros
+    kernels, projection_kernel = set(), captured_backward.projection_kernel
 
     def watch(tensor, *shape, **options):
         zeros = new_zeros(tensor, *shape, **options)
@@ -162,6 +163,11 @@ def test_gradients_of_the_camera_are_the_references_each_time(count, few, requir
             rows.append(weakref.ref(zeros))
         return zeros
 
+    def watch_kernel(*kind):
+        kernels.add(kind[-1])
+        return projection_kernel(*kind)
+
+    monkeypatch.setattr(captured_backward, "projection_kernel", watch_kernel)
     for place, tensor in enumerate(scene.tensors):
         tensor.requires_grad_(place in required)
     leaves = [scene.tensors[place] for place in required]
@@ -177,6 +183,7 @@ def test_gradients_of_the_camera_are_the_references_each_time(count, few, requir
             assert mine.shape == right.shape and mine.is_contiguous() and right.any()
             assert relative_error(mine, right) < 1e-4
     assert len({tensor.data_ptr() for each in gradients for tensor in each}) == 3 * len(required)
+    assert kernels == {bool({5, 6} & {*required})}
     assert len(rows) == 3 * len({5, 6} & {*required}) and not any(row() is not None for row in rows)
 
 
