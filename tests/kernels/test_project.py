@@ -5,9 +5,11 @@ import math
 import pytest
 import torch
 
-from sehdr_warp.rasterizer.projection import project_to_camera
+from sehdr_warp.kernels.project import projection_kernel
+from sehdr_warp.rasterizer.projection import launch_projection, project_to_camera, projection_parameters
 from sehdr_warp.rasterizer.reference import project_reference
 from sehdr_warp.rasterizer.render_options import RenderOptions
+from sehdr_warp.rasterizer.warp_launch.launching import warp_scalar
 
 from ..rasterizer.scenes import finite_differences, random_like, random_scene, relative_error
 
@@ -56,6 +58,25 @@ def test_quaternions_of_any_length_turn_alike(device, dtype, bound, length):
         results.append((conics, factor * leaves[2].grad.double()))
     for ours, truth in zip(*results[::-1], strict=True):
         assert relative_error(ours, truth) < bound and truth.any()
+
+
+def test_gaussians_with_cameras_of_their_own_are_projected_each_by_its_own(device):
+    *gaussians, pose, intrinsics = (tensor.to(device) for tensor in inputs(count=6, spread=0.5))
+    poses, lenses = pose.repeat(6, 1, 1), torch.linspace(1, 2, 6, device=device)[:, None] * intrinsics
+    poses[:, 2, 3] += torch.arange(6, device=device) + 3.0
+    leaves = [tensor.detach().requires_grad_() for tensor in (*gaussians, poses, lenses)]
+    kernel = projection_kernel(warp_scalar(torch.float64), False, False, True)
+    outputs = [torch.empty(6, *shape, dtype=torch.float64, device=device) for shape in ((2,), (3,), (), (), (2,))]
+    ours = launch_projection(kernel, leaves, projection_parameters(OPTIONS), outputs)
+    each = [
+        project_to_camera(*(leaf[i : i + 1] for leaf in leaves[:4]), poses[i], lenses[i], OPTIONS) for i in range(6)
+    ]
+    for mine, *others in zip(ours, *each, strict=True):
+        torch.testing.assert_close(mine, torch.cat(others), rtol=1e-12, atol=0)
+    seen = ours[4][:, 0] > 0
+    assert seen.sum() > 3
+    for gradient in torch.autograd.grad(total(ours, seen), leaves[4:]):
+        assert torch.equal(gradient.flatten(1).any(1), seen)
 
 
 @pytest.mark.parametrize("which", [1, 2], ids=["log_scales", "quaternions"])

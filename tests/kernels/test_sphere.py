@@ -6,7 +6,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sehdr_warp.kernels.constants import ALPHA_MAX, ALPHA_THRESHOLD, EPS2D
+from sehdr_warp.kernels.sphere import projection_kernel
 from sehdr_warp.rasterizer import rasterize, rasterize_directions
+from sehdr_warp.rasterizer.projection import launch_projection
+from sehdr_warp.rasterizer.warp_launch.launching import warp_scalar
 
 from ..rasterizer.scenes import finite_differences, random_like, relative_error
 
@@ -128,6 +131,23 @@ def test_gradients_match_finite_differences(device, which, antialiased):
         leaves = [tensor.clone().requires_grad_() for tensor in tensors]
         loss(*leaves, dtype=dtype).backward()
         assert relative_error(leaves[which].grad, numeric) < bound
+
+
+def test_gaussians_with_positions_of_their_own_are_projected_each_from_its_own(device):
+    *shapes, _ = gaussians(6, device=device)
+    positions = torch.linspace(-0.5, 0.5, 18, dtype=torch.float64, device=device).view(6, 3).requires_grad_()
+    kernels = [projection_kernel(warp_scalar(torch.float64), False, own) for own in (True, False)]
+
+    def project(kernel, *inputs):
+        outputs = [inputs[0].new_empty(len(inputs[0]), *shape) for shape in ((4,), (3,), (3,), (), ())]
+        return launch_projection(kernel, inputs, (0.01, 1e-4, 0.0, ALPHA_THRESHOLD), outputs)
+
+    ours = project(kernels[0], *shapes, positions)
+    each = [project(kernels[1], *(part[i : i + 1] for part in shapes), positions[i].detach()) for i in range(6)]
+    for mine, *others in zip(ours, *each, strict=True):
+        torch.testing.assert_close(mine, torch.cat(others), rtol=1e-12, atol=0)
+    [gradient] = torch.autograd.grad(sum((part * random_like(part, 1)).sum() for part in ours[:4]), positions)
+    assert gradient.any(1).all()
 
 
 def gradients(scene, directions, **options):
