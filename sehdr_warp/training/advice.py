@@ -158,7 +158,7 @@ class FinishedTraining:
             reason, remedy = "in photos of several days or cameras", "train on those of one day"
         else:
             reason = "where exposure or sun changed"
-            remedy = "state their exposure times in exposures.json beside the photos, or move them elsewhere"
+            remedy = "state their times in exposures.json beside the photos, or move these photos out of the folder"
         return f"{what} (stops: {names}), as {reason}: {remedy}: {self._again}"
 
     def _wrong_cameras(self) -> str | None:
@@ -179,7 +179,7 @@ class FinishedTraining:
         what = f"the camera{'s' if several else ''} of {first_names(names, 10)} seem{'' if several else 's'} wrong"
         shows = "these photos alone show" if several else "this photo alone shows"
         reason = f"{shows} another scene over much of the picture"
-        return f"{what}: {reason}; move {'them' if several else 'it'} elsewhere: {self._again}"
+        return f"{what}: {reason}; move {'them' if several else 'it'} out of the folder: {self._again}"
 
     def _movement(self) -> list[str]:
         """Return advice on masks or uncertain cameras, if photos differ from the scene in many places, not by blur."""
@@ -194,7 +194,7 @@ class FinishedTraining:
         text = "photos and scene differ in many places"
         if 2 * sum(region["photo"] in self.uncertain for region in worst) > len(worst):
             names = first_names([photo for photo in photos if photo in self.uncertain])
-            remedy = "add photos from places between them and the others, or move them elsewhere"
+            remedy = "add photos from places between them and the others, or move them out of the folder"
             return [f"{text}, most in photos whose cameras are uncertain ({names}): {remedy}: {self._again}"]
         remedy = "make these black in the photos' masks, masks/PHOTO.png beside them"
         return [f"{text}, as where people or leaves move (worst in {first_names(photos)}): {remedy}: {self._again}"]

@@ -61,7 +61,7 @@ def test_photos_of_another_exposure_are_named_with_the_command():
     figures = summary([28, 28, 28], regions=100) | {"brightness_offsets": {"a": 0.1, "b": -0.9, "c": 0.5, "d": 0.0}}
     [line] = advice(Path("r"), figures, 10, "my photos")
     assert line.startswith("2 photos are brighter or darker") and "b -0.9, c +0.5" in line
-    assert line.endswith("or move them elsewhere: sehdr-warp train 'my photos' --out r --overwrite")
+    assert line.endswith("or move these photos out of the folder: sehdr-warp train 'my photos' --out r --overwrite")
     figures["brightness_offsets"]["d"] = 1.0  # Most of them
     assert "as in photos of several days or cameras: train on those of one day" in advice(Path("r"), figures, 10)[0]
 
@@ -137,9 +137,14 @@ def test_single_photos_that_show_another_scene_have_wrong_cameras():
         return advice(Path("r"), figures | found, 40, **{"sizes": sizes} | options)
 
     [line] = lines(2)
-    assert line.startswith("the cameras of p0, p1 seem wrong: these photos") and "; move them elsewhere: " in line
+    assert (
+        line.startswith("the cameras of p0, p1 seem wrong: these photos") and "; move them out of the folder: " in line
+    )
     [line] = lines(1)
-    assert line.startswith("the camera of p0 seems wrong: this photo alone shows") and "; move it elsewhere: " in line
+    assert (
+        line.startswith("the camera of p0 seems wrong: this photo alone shows")
+        and "; move it out of the folder: " in line
+    )
     assert lines(2, pixels=50) == lines(2, stops=2.0) == lines(5) == lines(2, sizes={}) == []
     [line] = lines(1, figures=summary([26, 27, 28]))
     assert "more steps help" in line
