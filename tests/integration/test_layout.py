@@ -26,12 +26,12 @@ ELSEWHERE = {
         "kernels/ssim_cuda",
     ],
     "with what calls them, in other tests of their folder": [
-        "blocks/seams", "prior/network", "rasterizer/caller_lists", "rasterizer/cuda_graphs/render_graph",
-        "rasterizer/warp_launch/loading", "rasterizer/warp_launch/packing",
+        "blocks/seams", "check/*", "prior/network", "rasterizer/caller_lists",
+        "rasterizer/cuda_graphs/render_graph", "rasterizer/warp_launch/loading", "rasterizer/warp_launch/packing",
     ],
     "on the command line": ["evaluation/commands", "runs/commands", "scene/commands", "training/commands"],
-    "by being part of tests": ["check/*", "rasterizer/reference"],
-    "not alone: a few lines, names or types": [
+    "as what tests compare with": ["rasterizer/reference"],
+    "through what uses them: a few lines, names or types": [
         "caches", "kernels/constants", "model/renders", "rasterizer/render_options", "response/names", "runs/field",
         "scene/images/xmp", "training/training_progress",
     ],
@@ -55,14 +55,15 @@ def test_a_test_has_the_name_of_its_module():
         assert (folder / f"{name}.py").is_file() or (folder / name).is_dir(), f"{folder} has no {name}.py: {remedy}"
 
 
-def test_a_module_has_a_test_of_its_name_or_is_named_here():
+def test_a_module_has_a_test_of_its_name_or_is_listed_here():
     folders = (ROOT, "kernels"), (ROOT / "sehdr_warp", "")
     files = {path.relative_to(root) for root, folder in folders for path in (root / folder).rglob("[!_]*.py")}
-    alone = {
+    modules = {
         file.with_suffix("").as_posix() for file in files if not (TESTS / file.parent / f"test_{file.name}").is_file()
     }
     patterns = [pattern for group in ELSEWHERE.values() for pattern in group]
-    unnamed = [module for module in sorted(alone) if not any(fnmatch(module, pattern) for pattern in patterns)]
-    assert not unnamed, f"{unnamed}: write tests/PACKAGE/test_MODULE.py, or say in ELSEWHERE where it is tested"
-    tested = [pattern for pattern in patterns if not any(fnmatch(module, pattern) for module in alone)]
-    assert not tested, f"{tested} are gone or have tests of their own: take them out of ELSEWHERE"
+    missing = [module for module in sorted(modules) if not any(fnmatch(module, pattern) for pattern in patterns)]
+    remedy = "write tests/PACKAGE/test_MODULE.py, or add it to ELSEWHERE here, under where it is tested"
+    assert not missing, f"{missing} have no test of their name: {remedy}"
+    needless = [pattern for pattern in patterns if not any(fnmatch(module, pattern) for module in modules)]
+    assert not needless, f"{needless} are gone or have a test of their name: take them out of ELSEWHERE here"
