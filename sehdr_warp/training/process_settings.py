@@ -48,20 +48,20 @@ class _Settings(NamedTuple):
     """Settings of the process that a training changes."""
 
     threads: int
-    deterministic: bool
+    deterministic: int  # 0 if torch's sums need no fixed order, 1 if it warns of those without, 2 if it refuses them
     fills_memory: bool  # Whether torch fills new memory while deterministic, for finding errors
     switch_interval: float  # Seconds
 
     @staticmethod
     def current() -> "_Settings":
-        deterministic, fills = torch.are_deterministic_algorithms_enabled(), _memory.fill_uninitialized_memory
+        deterministic, fills = torch.get_deterministic_debug_mode(), _memory.fill_uninitialized_memory
         return _Settings(torch.get_num_threads(), deterministic, fills, sys.getswitchinterval())
 
     def restore(self) -> None:
         torch.set_num_threads(self.threads)
         sys.setswitchinterval(self.switch_interval)
-        if self.deterministic != torch.are_deterministic_algorithms_enabled():  # The call loads torch's compiler, 2 s.
-            torch.use_deterministic_algorithms(self.deterministic)
+        if self.deterministic != torch.get_deterministic_debug_mode():  # The call loads torch's compiler, 2 s.
+            torch.use_deterministic_algorithms(self.deterministic > 0, warn_only=self.deterministic == 1)
         _memory.fill_uninitialized_memory = self.fills_memory
 
 

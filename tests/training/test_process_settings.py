@@ -24,6 +24,16 @@ def test_torchs_settings_are_those_of_before_also_after_an_error(deterministic):
     torch.set_num_threads(threads - 1)
 
 
+def test_a_process_whose_torch_only_warned_of_other_sums_warns_again():
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        with torch_settings(True):
+            assert not torch.is_deterministic_algorithms_warn_only_enabled()
+        assert torch.are_deterministic_algorithms_enabled() and torch.is_deterministic_algorithms_warn_only_enabled()
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
 def test_trainings_that_take_turns_leave_the_settings_of_before_the_first():
     before = torch.get_num_threads(), sys.getswitchinterval()
     first, second = torch_settings(True), torch_settings(True)
