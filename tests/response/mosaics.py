@@ -23,7 +23,7 @@ def by_name(selection) -> dict:
     return {score.response.name: score for score in selection.scores}
 
 
-def named(*names) -> list[Response]:
+def responses(*names) -> list[Response]:
     return [response_by_name(name) for name in names]
 
 

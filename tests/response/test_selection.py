@@ -9,11 +9,11 @@ from sehdr_warp.response.selection import select_response
 from sehdr_warp.response.selection_scores import FINE, edge_facts, family_curves
 from sehdr_warp.response.table import TabulatedResponse
 
-from .mosaics import CODES, mosaic, named, photograph, stops_off
+from .mosaics import CODES, mosaic, photograph, responses, stops_off
 
 
 def test_thousands_of_edges_are_all_looked_at_and_count_as_few_facts_and_more_are_drawn_from():
-    photos, few = [photograph("srgb", mosaic(seed)) for seed in range(4)], named("srgb", "filmic")
+    photos, few = [photograph("srgb", mosaic(seed)) for seed in range(4)], responses("srgb", "filmic")
     selection, again = (select_response(photos[:3], few, seed=seed) for seed in (0, 1))
     assert 3000 < selection.edge_count < select_response(photos, few).edge_count == 4000
     assert [score.posterior for score in selection.scores] == [score.posterior for score in again.scores]
@@ -50,7 +50,7 @@ def test_uncertainty_is_small_with_edges_and_large_without():
     clean = select_response([photograph("srgb", mosaic(seed)) for seed in range(4)])
     grey = select_response(np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3)))
     assert clean.uncertainty < 0.2 < 0.4 < grey.uncertainty < 3
-    alone = select_response(photograph("srgb", mosaic()), candidates=named("srgb"))
+    alone = select_response(photograph("srgb", mosaic()), candidates=responses("srgb"))
     assert alone.uncertainty == pytest.approx(0, abs=1e-6)
     assert np.isnan(select_response(photograph("srgb", mosaic()), method="paper").uncertainty)
 

@@ -6,7 +6,7 @@ import pytest
 from sehdr_warp.response import response_by_name
 from sehdr_warp.response.selection import select_response
 
-from .mosaics import by_name, mosaic, named, photograph
+from .mosaics import by_name, mosaic, photograph, responses
 
 
 def shaded(light, seed) -> np.ndarray:
@@ -56,7 +56,7 @@ def normal_light() -> np.ndarray:
 )
 def test_light_without_edges_tells_curves_apart(light, pair, part, apart):
     for right, wrong in (pair, pair[::-1]):
-        scores = by_name(select_response(photograph(right, light()), named(*pair)))
+        scores = by_name(select_response(photograph(right, light()), responses(*pair)))
         assert getattr(scores[right], part) < getattr(scores[wrong], part) - apart
 
 

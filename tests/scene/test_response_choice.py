@@ -22,7 +22,7 @@ def test_a_response_that_is_a_guess_is_noted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("cameras", "told"),
+    ("cameras", "notes"),
     [
         (
             ("NIKON D70\0\0", "PENTAX 67", "NIKON D70"),
@@ -31,13 +31,13 @@ def test_a_response_that_is_a_guess_is_noted(tmp_path):
         (("NIKON D70\0\0", "NIKON D70"), []),
     ],
 )
-def test_photos_of_several_cameras_are_told_of(tmp_path, cameras, told):
+def test_photos_of_several_cameras_are_told_of(tmp_path, cameras, notes):
     write_colmap(tmp_path)
     for number, camera in enumerate(cameras):
         path, tags = tmp_path / "images" / f"{number:03d}.png", Image.Exif()
         tags[0x0110] = camera
         Image.fromarray(pattern(64, 48, number)).save(path, exif=tags)
-    assert [note for note in load(tmp_path).notes if "cameras get" in note] == told
+    assert [note for note in load(tmp_path).notes if "cameras get" in note] == notes
 
 
 def test_the_response_is_chosen_from_codes_as_photographed():
