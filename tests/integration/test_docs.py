@@ -122,14 +122,14 @@ def test_links_lead_somewhere(page):
 
 
 def test_the_site_lists_every_page():
-    listed = (ROOT / "mkdocs.yml").read_text()
-    missing = [page.name for page in GUIDE if page.name not in listed]
+    pages = (ROOT / "mkdocs.yml").read_text()
+    missing = [page.name for page in GUIDE if page.name not in pages]
     assert not missing, f"add them to nav in mkdocs.yml: {missing}"
 
 
 def test_the_api_page_lists_every_public_name():
-    listed = set(re.findall(r"^::: \S+\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE))
-    assert set(sehdr_warp.__all__) <= listed, f"add to docs/api.md: {set(sehdr_warp.__all__) - listed}"
+    names = set(re.findall(r"^::: \S+\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE))
+    assert set(sehdr_warp.__all__) <= names, f"add to docs/api.md: {set(sehdr_warp.__all__) - names}"
 
 
 # Words on one page. A page that outgrows its budget is split by topic or shortened.

@@ -18,8 +18,8 @@ def absolute_gradients(scene, weights, by_transmittance, *, in_order=True):
     lists = build_tile_lists(splats, order, WIDTH, HEIGHT, keep_emit_order=in_order)
     image, transmittance = (tensor.clone().requires_grad_() for tensor in (weights, by_transmittance))
     results = []
-    watched = watch_absolute_gradients(image, transmittance, scene.tensors[4], lists, splats, THRESHOLD, results.append)
-    torch.autograd.backward(watched, (weights, by_transmittance))
+    outputs = watch_absolute_gradients(image, transmittance, scene.tensors[4], lists, splats, THRESHOLD, results.append)
+    torch.autograd.backward(outputs, (weights, by_transmittance))
     assert torch.equal(image.grad, weights) and torch.equal(transmittance.grad, by_transmittance)
     return results[0]
 

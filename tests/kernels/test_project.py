@@ -23,8 +23,8 @@ def inputs(**options):
     return [*scene.tensors[:4], *scene.tensors[5:]]
 
 
-def total(results, seen):
-    return sum((part[seen] * random_like(part, k)[seen]).sum() for k, part in enumerate(results[:4]))
+def total(results, visible):
+    return sum((part[visible] * random_like(part, k)[visible]).sum() for k, part in enumerate(results[:4]))
 
 
 @pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
@@ -34,13 +34,13 @@ def test_values_and_gradients_are_the_references(device, dtype, bound, antialias
     ours = [tensor.detach().to(device, dtype).requires_grad_() for tensor in leaves]
     truth = project_reference(*[*leaves, *OPTIONS[:5]], antialiased)
     results = project_to_camera(*ours, OPTIONS._replace(antialiased=antialiased))
-    seen = truth[4][:, 0] > 0
-    assert 30 < seen.sum() < 120 and torch.equal(results.extents.cpu()[:, 0] > 0, seen)
+    visible = truth[4][:, 0] > 0
+    assert 30 < visible.sum() < 120 and torch.equal(results.extents.cpu()[:, 0] > 0, visible)
     for name, mine, true in zip(RESULTS, results, truth, strict=True):
-        assert relative_error(mine[seen.to(device)], true[seen]) < bound / 10, name
-    assert not results.opacities[~seen.to(device)].any()
-    total(truth, seen).backward()
-    total(results, seen.to(device)).backward()
+        assert relative_error(mine[visible.to(device)], true[visible]) < bound / 10, name
+    assert not results.opacities[~visible.to(device)].any()
+    total(truth, visible).backward()
+    total(results, visible.to(device)).backward()
     for name, mine, true in zip(NAMES, ours, leaves, strict=True):
         assert relative_error(mine.grad, true.grad) < bound, name
 
@@ -73,10 +73,10 @@ def test_gaussians_with_cameras_of_their_own_are_projected_each_by_its_own(devic
     ]
     for mine, *others in zip(ours, *each, strict=True):
         torch.testing.assert_close(mine, torch.cat(others), rtol=1e-12, atol=0)
-    seen = ours[4][:, 0] > 0
-    assert seen.sum() > 3
-    for gradient in torch.autograd.grad(total(ours, seen), leaves[4:]):
-        assert torch.equal(gradient.flatten(1).any(1), seen)
+    visible = ours[4][:, 0] > 0
+    assert visible.sum() > 3
+    for gradient in torch.autograd.grad(total(ours, visible), leaves[4:]):
+        assert torch.equal(gradient.flatten(1).any(1), visible)
 
 
 @pytest.mark.parametrize("which", [1, 2], ids=["log_scales", "quaternions"])

@@ -7,7 +7,7 @@ import torch
 from sehdr_warp.rasterizer.losses.code_residual import code_tensor, sample_residual_pixels
 
 LEAST = 0.02
-SIZE = 24, 18  # At which pixels are told, of a photo of 12 x 9
+SIZE = 24, 18  # In whose pixels draws are returned; the photo has 12 x 9
 
 
 def sampled_pixels(image, codes, device, *, index=None, mask=None, count=4000):

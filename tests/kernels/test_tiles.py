@@ -24,14 +24,14 @@ def test_lists_hold_what_pixels_show_in_order_of_depth(device, dtype, in_order):
     dx, dy = columns - x, rows - y
     alpha = opacity * np.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
     alpha[splats.extents[:, 0].cpu() == 0] = 0
-    shown = (alpha > THRESHOLD).reshape(-1, 4, 16, 5, 16).any((2, 4)).reshape(-1, 20)
-    listed, depths = np.zeros_like(shown), splats.depths.double().cpu().numpy()
+    visible = (alpha > THRESHOLD).reshape(-1, 4, 16, 5, 16).any((2, 4)).reshape(-1, 20)
+    in_list, depths = np.zeros_like(visible), splats.depths.double().cpu().numpy()
     for tile, (begin, end) in enumerate(lists.tile_ranges.tolist()):
         here = lists.gaussians[begin:end].cpu().numpy()
-        listed[here, tile] = True
+        in_list[here, tile] = True
         assert len(set(here)) == len(here) and (np.diff(depths[here]) >= 0).all()
-    assert not (shown & ~listed).any() and (listed & ~shown).sum() < 0.05 * shown.sum() and shown.sum() > 200
-    np.testing.assert_array_equal(splats.counts.cpu(), listed.sum(1))
+    assert not (visible & ~in_list).any() and (in_list & ~visible).sum() < 0.05 * visible.sum() and visible.sum() > 200
+    np.testing.assert_array_equal(splats.counts.cpu(), in_list.sum(1))
 
 
 @pytest.mark.parametrize("count", [0, 1, 300])
