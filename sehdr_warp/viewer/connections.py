@@ -19,7 +19,7 @@ MOST_BYTES = 64 << 20
 SILENCE = 60.0  # Seconds that a connection may be open without a request
 STALL = 15.0  # Seconds that a client may read nothing of its answer
 SHORT_STALL = 0.25  # The same, if others wait for the room that its answer takes
-_ROOM_WAIT = 20.0  # Seconds that an answer waits for room
+ROOM_WAIT = 20.0  # Seconds that an answer waits for room
 _CHUNK = 1 << 18
 
 
@@ -100,7 +100,11 @@ class Connection:
 
 
 class Connections:
-    """The open connections of a server."""
+    """The open connections of a server.
+
+    Attributes:
+        by_socket: Each connection by the socket of its client.
+    """
 
     def __init__(self) -> None:
         """Begin without connections."""
@@ -156,7 +160,7 @@ class Connections:
 
         Raises BusyError if there is none after a while.
         """
-        end = time.monotonic() + _ROOM_WAIT
+        end = time.monotonic() + ROOM_WAIT
         with self._changed:
             while (
                 by_others := sum(each.reserved_bytes for each in self.by_socket.values() if each is not connection)

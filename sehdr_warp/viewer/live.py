@@ -32,6 +32,11 @@ class LiveTraining(ViewerScene):
     attend() passes on the training's steps. Between them it renders pictures that browsers wait for, for at most SHARE
     of the time, and no longer than that at a stretch unless one picture takes longer. Nothing the training reads is
     changed: its result is the same as without a viewer.
+
+    Attributes:
+        paused: Whether the training waits.
+        ended: Whether it is over.
+        picture_seconds: Time that pictures took while it was not paused.
     """
 
     def __init__(self, training: Any, name: str):

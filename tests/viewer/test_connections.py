@@ -125,7 +125,7 @@ def test_the_end_of_the_server_ends_a_save(serve):
 
 def test_room_is_reserved_until_the_end_of_an_answer(monkeypatch):
     monkeypatch.setattr(connections, "MOST_BYTES", 100)
-    monkeypatch.setattr(connections, "_ROOM_WAIT", 0.1)
+    monkeypatch.setattr(connections, "ROOM_WAIT", 0.1)
     both, (first, second) = connections.Connections(), socket.socketpair()
     with first, second:
         assert both.add(first) and both.add(second)

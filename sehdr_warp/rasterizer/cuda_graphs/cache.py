@@ -236,6 +236,7 @@ class GraphPool:
 
 _lock = threading.Lock()
 pools: dict[CallPattern, GraphPool] = {}
+"""The CUDA graphs of all calls."""
 _uses = count(1)
 
 

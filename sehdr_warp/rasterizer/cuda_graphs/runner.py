@@ -71,6 +71,7 @@ replays_are_off: Callable[[], bool] = _replays_are_off.get  # Whether this is wi
 
 
 idle_streams: dict[torch.device, list[torch.cuda.Stream]] = {}
+"""Streams whose owner is gone, for own_stream()."""
 
 
 def own_stream(owner, device: torch.device) -> torch.cuda.Stream:
