@@ -127,7 +127,11 @@ def test_rows_that_do_not_count_are_left_alone(device):
 
 def test_no_numbers_are_no_work(device):
     empty, one = torch.zeros(0, 3, device=device), torch.ones((), device=device)
-    adam_steps([AdamStep(empty, empty, empty, empty, one, one)], one, **OPTIONS)
+    parameter, moments = torch.ones(2, 3, device=device), torch.zeros(2, 2, 3, device=device)
+    gradient = torch.ones_like(parameter)
+    steps = [AdamStep(empty, empty, empty, empty, one, 0.1), AdamStep(parameter, gradient, *moments, one, 0.1)]
+    adam_steps(steps, 0 * one, **OPTIONS)
+    torch.testing.assert_close(parameter, torch.full_like(parameter, 0.9))
 
 
 def test_a_step_is_skipped_where_something_is_not_finite_or_incomplete(device):

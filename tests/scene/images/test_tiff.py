@@ -47,7 +47,8 @@ def test_further_pictures_of_a_tiff(tmp_path, kind):
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("options", [
     {"planarconfig": "separate"}, {"planarconfig": "separate", "rowsperstrip": 5},
-    {"planarconfig": "separate", "compression": "deflate", "rowsperstrip": 5}, {"extrasamples": [0]}, {"extrasamples": [2]},
+    {"planarconfig": "separate", "compression": "deflate", "rowsperstrip": 5},
+    {"extrasamples": [0]}, {"extrasamples": [2]},
     {"compression": "lzw", "predictor": True, "tile": (16, 16)}, {"bigtiff": True},
     {"bigtiff": True, "planarconfig": "separate"},
 ], ids=str)  # fmt: skip
