@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene.readers.transforms import read_transforms
+from sehdr_warp.scene.readers.transforms import is_transforms, read_transforms
 from tests.make_scenes import arc_poses, edit_transforms, edited_json, load, write_blender, write_colmap, write_ply
 
 
@@ -250,3 +250,10 @@ def test_splits_under_other_spellings(tmp_path):
     names = [f"images/r_{i}" for i in range(6)]
     write_blender(tmp_path, 6, train_filenames=names[:4], test_filenames=["./" + names[4], names[5].replace("/", "\\")])
     assert [view.name for view in load(tmp_path).test_views] == ["r_4", "r_5"]
+
+
+def test_files_of_frames_without_poses_are_no_transforms(tmp_path):
+    path = tmp_path / "capture.json"
+    for text, is_one in (('{"frames": [{"transform_matrix": []}]}', True), ('{"frames": []}', False)):
+        path.write_text(text)
+        assert is_transforms(path) == is_one
