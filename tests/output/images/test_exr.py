@@ -13,8 +13,10 @@ from sehdr_warp.output.images.exr import (
     stored_pixel_type,
     write_exr,
     write_multipart_exr,
+    write_radiance,
 )
 from sehdr_warp.scene import Camera
+from sehdr_warp.scene.images.hdr_files import read_hdr
 
 from ...full_disk import full_disk
 from ..helpers import camera, radiance, read_exr
@@ -69,6 +71,14 @@ def test_metadata_reaches_both_readers(tmp_path):
     assert spec.get_float_attribute("ExposureTime") == np.float32(0.1)
     assert spec.get_string_attribute("DateTime") == "2025:01:02 03:04:05"
     np.testing.assert_allclose(np.reshape(spec.getattribute("worldToCamera"), (4, 4)), attributes["worldToCamera"])
+
+
+def test_radiance_files_hold_light_within_a_part_in_256_of_the_largest_channel(tmp_path):
+    light = np.random.default_rng(0).uniform(0, 1, (5, 9, 3)) * np.exp2(np.linspace(-40, 40, 9))[:, None]
+    light[2] = 0.0
+    write_radiance(tmp_path / "a.hdr", light)
+    read = read_hdr(tmp_path / "a.hdr")
+    assert (np.abs(read - light) <= light.max(axis=2, keepdims=True) / 128).all() and not read[2].any()
 
 
 def test_camera_matrices_follow_their_conventions():
