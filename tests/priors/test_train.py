@@ -1,6 +1,7 @@
 """Training of the prior: the target of several teachers, and the command from a pack to a weights file."""
 
 import numpy as np
+import pytest
 import torch
 
 from priors import rooms, train
@@ -53,6 +54,14 @@ def test_the_loss_is_smallest_at_the_mean_of_the_target(monkeypatch):
     assert wider.grad is not None and wider.grad.min() > 0
 
 
+@pytest.fixture
+def own_settings():
+    """Restore what the command sets for its process."""
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.usefixtures("own_settings")
 def test_the_command_trains_teachers_once_and_the_network_from_them(tmp_path, monkeypatch):
     for module, name, value in (
         (train, "BATCH", 5),
