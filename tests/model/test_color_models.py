@@ -20,6 +20,14 @@ def test_colors_of_the_log_model_stay_finite_and_nan_stays_nan(device):
     assert sums.grad[0].tolist() == [0, 0, 0] and sums.grad[1, :2].tolist() == [0, 1]
 
 
+@pytest.mark.parametrize("radiance", ["log", "linear"])
+def test_brighter_values_have_brighter_colors(radiance):
+    model, factors = make_color_model(radiance), torch.tensor([[1.0, 3.0, 0.5]], dtype=torch.float64)
+    values = torch.from_numpy(model.start(np.array([[0.2, 0.5, 0.9]]), response_by_name("srgb")))
+    brighter = model.colors(model.brighten(values, factors.log()))
+    torch.testing.assert_close(brighter, factors * model.colors(values), rtol=1e-6, atol=0)
+
+
 @pytest.mark.parametrize("radiance", ["log", "linear", "display"])
 def test_start_colors_invert_the_color_model(radiance):
     model, srgb, encoded = make_color_model(radiance), response_by_name("srgb"), np.array([[0.2, 0.5, 0.9]])

@@ -53,6 +53,16 @@ def test_a_code_is_worth_the_middle_of_what_it_stands_for():
     assert light[128].item() == pytest.approx(float(response.decode(128 / 255)), rel=1e-3)
 
 
+@pytest.mark.parametrize("largest", [255, 65535])
+@pytest.mark.parametrize("clipping", [True, False])
+def test_the_ends_stand_for_all_values_beyond_half_an_8_bit_code(largest, clipping):
+    table = code_scale(largest, None, "cpu", clipping=clipping, dtype=torch.float64).table
+    half = 0.5 / 255
+    ends = [[0.0, -math.inf, half], [1.0, 1.0 - half, math.inf]] if clipping else [[0.0] * 3, [1.0] * 3]
+    torch.testing.assert_close(table[[0, -1]], torch.tensor(ends, dtype=torch.float64))
+    torch.testing.assert_close(table[7], torch.full((3,), 7 / largest, dtype=torch.float64))
+
+
 @pytest.mark.parametrize("clipping", [True, False])
 def test_light_anywhere_within_what_a_code_stands_for_is_as_good_once_it_is_an_interval(clipping):
     response = response_by_name("hdr-nerf")

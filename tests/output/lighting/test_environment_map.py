@@ -97,6 +97,8 @@ def test_upright_maps_look_ahead_with_up_above(tmp_path, run):
 
 def test_a_point_is_in_the_coordinates_of_exported_files(tmp_path, run):
     """A map at a place that a program measured in an exported scene, and beyond a distance in its meters."""
+    import OpenEXR
+
     write_environment_map(run, tmp_path / "scene.exr", at=(0.4, 0.2, 1), size=64, axes="scene", beyond=0.5)
     world = world_transform(run, scale=2.0)
     at = tuple(world.points(np.array([0.4, 0.2, 1])))
@@ -107,6 +109,12 @@ def test_a_point_is_in_the_coordinates_of_exported_files(tmp_path, run):
     weight = solid_angles(64, "latlong")[..., None]
     light = [(image * weight).sum(axis=(0, 1)) for image in (own, read(tmp_path / "file.exr")[0])]
     np.testing.assert_allclose(light[1], light[0], rtol=0.02)  # The same light, turned
+    farthest = []
+    for name in ("scene.exr", "file.exr"):
+        with OpenEXR.File(str(tmp_path / name), separate_channels=True) as file:
+            distance = file.channels(1)["distance.Z"].pixels
+            farthest.append(distance[np.isfinite(distance)].max())
+    assert farthest[1] == pytest.approx(2 * farthest[0], rel=1e-3)
 
 
 def looked_at(oiio, file, directions):
