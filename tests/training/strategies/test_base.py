@@ -4,6 +4,7 @@ import pytest
 
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.training.strategies import make_strategy
+from sehdr_warp.training.strategies.base import Schedule
 
 from ..toy import VARIANTS
 
@@ -19,6 +20,14 @@ def test_a_training_of_any_length_reaches_its_budget(iterations):
             assert iterations < 30_000 or growth <= 1.05 + 1 / count
             count = strategy.next_count(iteration, count)
     assert count == 120_000
+
+
+@pytest.mark.parametrize("start, stop, every", [(20, 80, 25), (0, 75, 25), (30, 76, 25), (90, 300, 25), (10, 30, 50)])
+def test_a_schedule_is_over_where_no_refinement_follows(start, stop, every):
+    schedule = Schedule(start, stop, every)
+    due = [n for n in range(401) if schedule.is_due(n, 1)]
+    assert [schedule.is_over(n) for n in range(400)] == [not any(each > n for each in due) for n in range(400)]
+    assert [schedule.refinements_left(n) for n in due] == [*range(len(due), 0, -1)]
 
 
 def test_a_refinement_at_most_doubles_the_count():
