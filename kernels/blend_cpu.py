@@ -50,7 +50,7 @@ class RowFunctions(NamedTuple):
     broadcast: Any  # A row of one value
     heaviside: Any  # 1 where a value is positive, else 0
     exponential: Any  # exp() of values that are not positive
-    reached_halves: Any  # First half of a tile that a Gaussian reaches, and one past the last
+    half_range: Any  # First half of a tile that a Gaussian reaches, and one past the last
 
 
 @cache
@@ -99,7 +99,7 @@ def row_functions(dtype, exp_squarings: int) -> RowFunctions:
             return e
 
     @wp.func
-    def reached_halves(x: real, conic_cutoff: vec4) -> wp.vec2i:
+    def half_range(x: real, conic_cutoff: vec4) -> wp.vec2i:
         """Return the first half that is reached and one past the last; x: from the tile's first pixel to the center."""
         determinant = conic_cutoff[0] * conic_cutoff[2] - conic_cutoff[1] * conic_cutoff[1]
         reached = wp.vec2i(0, wp.static(HALVES))
@@ -111,7 +111,7 @@ def row_functions(dtype, exp_squarings: int) -> RowFunctions:
             reached = wp.vec2i(int(first), int(wp.floor(last)) + 1)
         return reached
 
-    return RowFunctions(row, broadcast, heaviside, exponential, reached_halves)
+    return RowFunctions(row, broadcast, heaviside, exponential, half_range)
 
 
 def _options(dtype) -> dict:
@@ -140,7 +140,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
         image: [H W, C].
         final_transmittance: [H W], of all Gaussians together.
     """
-    row, broadcast, heaviside, exponential, reached_halves = row_functions(dtype, exp_squarings)
+    row, broadcast, heaviside, exponential, half_range = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
 
     @wp.kernel(module="unique", module_options=_options(dtype))
@@ -176,7 +176,7 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
             y = xy_opacity[1] - real(y0) - real(0.5)
             top = int(wp.max(wp.ceil(y - xy_opacity[3]), real(0.0)))
             bottom = int(wp.min(wp.floor(y + xy_opacity[3]), real(wp.static(size - 1)))) + 1
-            reached = reached_halves(x, conic_cutoff)
+            reached = half_range(x, conic_cutoff)
             for half in range(reached[0], reached[1]):
                 dx = broadcast(x - real(half * lanes)) - offsets
                 in_x = wp.cw_mul(dx, dx) * (real(-0.5) * conic_cutoff[0])
@@ -234,7 +234,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
         sums: scratch, [tiles, C + 6] rows: gradients of features; sums of slopes times 1, dx, dy, dx dx, dx dy, dy dy.
         grad_intersections: [M, C + 6] in the order of emission: features, conic a b c, x, y, opacity.
     """
-    row, broadcast, heaviside, exponential, reached_halves = row_functions(dtype, exp_squarings)
+    row, broadcast, heaviside, exponential, half_range = row_functions(dtype, exp_squarings)
     real, vec4, size, lanes = dtype, vector(4, dtype), TILE_SIZE, LANES
     of_1, of_x, of_y, of_xx, of_xy, of_yy = range(channels, channels + 6)
 
@@ -293,7 +293,7 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
             target = emit_indices[k]
             for column in range(wp.static(channels + 6)):
                 sums[tile, column] = broadcast(real(0.0))
-            reached = reached_halves(x, conic_cutoff)
+            reached = half_range(x, conic_cutoff)
             for half in range(reached[0], reached[1]):
                 dx = broadcast(x - real(half * lanes)) - offsets
                 in_x = wp.cw_mul(dx, dx) * (real(-0.5) * conic_cutoff[0])
