@@ -13,7 +13,7 @@ from ..rasterizer.scenes import packed, projected, random_like, random_scene, re
 BOUNDS = {torch.float64: 1e-12, torch.float32: 1e-5}
 
 
-def crowded(channels, count=600, width=44, height=26):
+def crowd(channels, count=600, width=44, height=26):
     """A scene of so much overlap that pixels finish early; its picture has cut tiles at the right and the bottom."""
     return random_scene(count=count, channels=channels, width=width, height=height, spread=1.6, seed=2)
 
@@ -53,12 +53,12 @@ def assert_blend_is_the_reference(scene, dtype, device, threshold=1 / 255, run=l
 @pytest.mark.parametrize("channels, threshold", [(1, 1 / 255), (3, 1 / 255), (9, 1 / 255), (3, 1e-9)])
 def test_it_is_the_reference(dtype, channels, threshold):
     """Also where the exponential reaches far down."""
-    assert (assert_blend_is_the_reference(crowded(channels), dtype, "cpu", threshold) < 0.001).any()
+    assert (assert_blend_is_the_reference(crowd(channels), dtype, "cpu", threshold) < 0.001).any()
 
 
 @pytest.mark.parametrize("light", [0.0, -1.0, 1e-30, 1e30])
 def test_extreme_light_is_blended_in_numbers(light):
-    scene = crowded(2, count=40)
+    scene = crowd(2, count=40)
     scene.tensors[3][::2] = 1.0  # No Gaussian hides all that is behind it.
     scene.tensors[4][:, 0] = light
     leaves, *arguments = leaves_and_lists(scene.to(torch.float32), 1 / 255)
@@ -69,7 +69,7 @@ def test_extreme_light_is_blended_in_numbers(light):
 
 
 def test_nothing_is_black():
-    leaves, *arguments = leaves_and_lists(crowded(3, count=0).to(torch.float32), 1 / 255)
+    leaves, *arguments = leaves_and_lists(crowd(3, count=0).to(torch.float32), 1 / 255)
     image, transmittance = blend(leaves, *arguments, 1 / 255)
     (image.sum() + transmittance.sum()).backward()
     assert not image.any() and (transmittance == 1).all() and leaves.features.grad.shape == (0, 3)

@@ -89,8 +89,8 @@ def test_confidence_that_is_measured_between_two_pictures_is_in_the_second(stree
     options = {"position": np.array([20.0, 0, 1]), "directions": rays, "focal_length": 10.0, "pixel_angle": 0.1}
     assert paged.render_directions(**options).confidence is None
     street.confidence = paged.confidence = confidence
-    found = paged.render_directions(**options).confidence
-    torch.testing.assert_close(found, street.render_directions(**options).confidence)
+    second = paged.render_directions(**options).confidence
+    torch.testing.assert_close(second, street.render_directions(**options).confidence)
 
 
 def test_far_cells_are_taken_at_a_lower_level_of_detail(street):

@@ -31,14 +31,14 @@ def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_th
     cameras = {view.name: view.camera for view in scene.views}
     views = [replace(view, camera=in_other_world(view.camera)) for view in scene.views]
     points = 3 * scene.points @ TURN.T + [1, 2, 3]
-    found = replace(scene, views=tuple(views), points=points)
-    aligned = in_world_of_run(found, cameras, 4.0, "run", "photos")
+    other_world = replace(scene, views=tuple(views), points=points)
+    aligned = in_world_of_run(other_world, cameras, 4.0, "run", "photos")
     for view in aligned.views:
         np.testing.assert_array_equal(view.camera.world_to_camera, cameras[view.name].world_to_camera)
     np.testing.assert_allclose(aligned.points, scene.points, atol=1e-12)
     assert in_world_of_run(scene, cameras, 4.0, "run", "photos") is scene
     del cameras[scene.views[-1].name]  # A photo that was added since is placed in the world of the run.
-    added = in_world_of_run(found, cameras, 4.0, "run", "photos").views[-1].camera
+    added = in_world_of_run(other_world, cameras, 4.0, "run", "photos").views[-1].camera
     np.testing.assert_allclose(added.world_to_camera, scene.views[-1].camera.world_to_camera, atol=1e-12)
     first = views[0].camera
     moved, turned = first.world_to_camera.copy(), first.world_to_camera.copy()

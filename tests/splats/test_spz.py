@@ -111,8 +111,8 @@ def test_extensions_are_named_and_harmonics_beyond_degree_3_refused(tmp_path, ca
     """An extension may state other axes; spz issue 84 and pull request 82."""
     write_gaussians(tmp_path / "a.spz", gaussians(5, 1, "display"))
     plain = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    flagged = plain[:14] + bytes([plain[14] | 2]) + plain[15:]  # Extensions lie behind the Gaussians.
-    (tmp_path / "b.spz").write_bytes(gzip.compress(flagged + struct.pack("<III", 0xADBE0003, 4, 5)))
+    with_flag = plain[:14] + bytes([plain[14] | 2]) + plain[15:]  # Extensions lie behind the Gaussians.
+    (tmp_path / "b.spz").write_bytes(gzip.compress(with_flag + struct.pack("<III", 0xADBE0003, 4, 5)))
     np.testing.assert_array_equal(read_gaussians(tmp_path / "b.spz").means, read_gaussians(tmp_path / "a.spz").means)
     assert "b.spz: its extensions are not read" in caplog.text and "a.spz" not in caplog.text
     (tmp_path / "c.spz").write_bytes(gzip.compress(plain[:12] + b"\4" + plain[13:]))

@@ -93,5 +93,5 @@ def test_nodes_train_bare_photos_in_the_world_of_rank_0():
         pose = view.camera.world_to_camera.copy()
         pose[:3, 3] = 2 * pose[:3, 3] - pose[:3, :3] @ [1, 2, 3]
         views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
-    found = replace(scene, views=tuple(views), points=2 * scene.points + [1, 2, 3])
-    np.testing.assert_allclose(photos_of_second_node(scene, Photos(found, {})).points, scene.points, atol=1e-12)
+    own_world = replace(scene, views=tuple(views), points=2 * scene.points + [1, 2, 3])
+    np.testing.assert_allclose(photos_of_second_node(scene, Photos(own_world, {})).points, scene.points, atol=1e-12)

@@ -306,7 +306,7 @@ def test_masks_count_if_whole_photos_place_no_more_than_they(monkeypatch, caplog
     lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
     images = tuple(ModelImage(image_name(i), lens, np.eye(4)) for i in range(4))
     cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
-    found = {masked: Reconstruction(SparseModel(images, cloud), 0.5, ()) for masked in (True, False)}
-    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): found[bool(masks)])
+    by_masks = {masks: Reconstruction(SparseModel(images, cloud), 0.5, ()) for masks in (True, False)}
+    monkeypatch.setattr(bare_photos, "reconstruct", lambda photos, cache, masks=(): by_masks[bool(masks)])
     files = [Path(f"{i}.jpg") for i in range(12)]
-    assert bare_photos.reconstruct_with_masks(files, None, files) is found[True] and not caplog.text
+    assert bare_photos.reconstruct_with_masks(files, None, files) is by_masks[True] and not caplog.text
