@@ -116,10 +116,11 @@ def test_what_cannot_be_planned_is_named(capfd, tmp_path):
         (["--jobs", "0"], "--jobs 0: not positive"),
         (["--slurm", "gpu"], "not NAME=VALUE separated by commas"),
     ):
-        line = refused(capfd, *[*SMALL, "--out", tmp_path / "out", *arguments])
+        command = [*SMALL, "--out", tmp_path / "out", *arguments]
+        line = refused(capfd, *command)
         assert message in line, line
-    request = ["--scenes", tmp_path / "photos", "--methods", "default"]
-    assert call(*[*SMALL, "--out", tmp_path / "out", *request]) == 1
+    command = [*SMALL, "--out", tmp_path / "out", "--scenes", tmp_path / "photos", "--methods", "default"]
+    assert call(*command) == 1
     assert "1 of 1 jobs failed, the first with: " in (line := capfd.readouterr().err) and "no HDR truth" in line
 
 

@@ -1,4 +1,4 @@
-"""What blocks cost."""
+"""Cost of blocks: time and memory as a plan states them."""
 
 from dataclasses import replace
 

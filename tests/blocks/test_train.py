@@ -142,7 +142,8 @@ def test_one_training_that_does_for_auto_takes_all_gpus(survey, tmp_path, monkey
         "sehdr_warp.training.launch.launch_ranks", lambda count, _, words: started.append((count, words))
     )
     words = ["train", str(survey), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu"]
-    assert call(*[*words, *flag]) == 0
+    command = [*words, *flag]
+    assert call(*command) == 0
     assert started == [(2, words)]
 
 

@@ -32,7 +32,8 @@ def total(results, visible):
 def test_values_and_gradients_are_the_references(device, dtype, bound, antialiased):
     leaves = [tensor.requires_grad_() for tensor in inputs()]
     ours = [tensor.detach().to(device, dtype).requires_grad_() for tensor in leaves]
-    truth = project_reference(*[*leaves, *OPTIONS[:5]], antialiased)
+    arguments = [*leaves, *OPTIONS[:5], antialiased]
+    truth = project_reference(*arguments)
     results = project_to_camera(*ours, OPTIONS._replace(antialiased=antialiased))
     visible = truth[4][:, 0] > 0
     assert 30 < visible.sum() < 120 and torch.equal(results.extents.cpu()[:, 0] > 0, visible)

@@ -78,7 +78,7 @@ def test_agrees_with_sums_in_numpy(device, antialiased, pixel_angle):
 
 
 def test_a_turned_scene_seen_in_turned_directions_is_the_same(device):
-    """So no direction is special: neither where a map wraps, nor its poles."""
+    """No direction is special: neither where a map wraps, nor its poles."""
     scene, directions = gaussians(device=device), latlong(device=device)
     position = torch.zeros(3, dtype=torch.float64, device=device)
     image, _ = rasterize_directions(*scene, position, directions, focal_length=FOCAL)

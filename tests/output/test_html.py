@@ -13,7 +13,7 @@ from sehdr_warp.output.html import join, json_block, markup, whole_page, with_co
 
 @pytest.mark.parametrize("path", sorted(Path(output.__file__).parent.rglob("*.py")), ids=lambda path: path.name)
 def test_no_markup_is_made_but_by_the_one_function(path):
-    """Of f-strings nothing escapes what goes in, and a template that is made of text is no template."""
+    """F-strings escape nothing, so only the one function may make markup of text."""
     for node in ast.walk(ast.parse(path.read_text())):
         for part in node.values if isinstance(node, ast.JoinedStr) else ():
             if isinstance(part, ast.Constant):

@@ -1,4 +1,4 @@
-"""What simulated photos' numbers are made of."""
+"""Values of simulated photos: curves, noise, white balance."""
 
 import numpy as np
 import torch

@@ -72,10 +72,11 @@ def test_a_gaussian_that_is_not_finite_is_gone(place, value, dtype, device):
 def test_a_quaternion_of_zeros_turns_nothing_and_has_no_gradient(device):
     gaussians, shared = scene(device, torch.float32), cameras(device, torch.float32)
     gaussians[2][3] = 0.0
-    image, grads = gradients(lambda *tensors: rasterize(*tensors, WIDTH, HEIGHT).image, [*gaussians, *shared])
+    arguments = [*gaussians, *shared]
+    image, grads = gradients(lambda *tensors: rasterize(*tensors, WIDTH, HEIGHT).image, arguments)
     assert not grads[2][3].any() and grads[2].any()
     gaussians[2][3] = torch.tensor([1.0, 0, 0, 0])
-    assert torch.equal(rasterize(*[*gaussians, *shared], WIDTH, HEIGHT).image, image)
+    assert torch.equal(rasterize(*arguments, WIDTH, HEIGHT).image, image)
 
 
 @pytest.mark.parametrize("place, value", BAD[:-1])
@@ -109,11 +110,12 @@ def test_harmonics_of_a_gaussian_that_is_gone_leave_the_position_its_gradient(ba
 def test_a_camera_that_is_not_finite_shows_nothing_on_a_gpu_and_is_refused_on_the_cpu(device):
     gaussians, (pose, lens) = scene(device, torch.float32), cameras(device, torch.float32)
     for bad in ([pose * NAN, lens], [pose, lens * NAN], [pose * INF, lens]):
+        arguments = [*gaussians, *bad]
         if device == "cpu":
             with pytest.raises(ValueError, match="finite"):
-                rasterize(*[*gaussians, *bad], WIDTH, HEIGHT)
+                rasterize(*arguments, WIDTH, HEIGHT)
             continue
-        image, grads = gradients(lambda *t: rasterize(*t, WIDTH, HEIGHT).image, [*gaussians, *bad])
+        image, grads = gradients(lambda *t: rasterize(*t, WIDTH, HEIGHT).image, arguments)
         assert bool((image == 0).all()) and all(bool((gradient == 0).all()) for gradient in grads)
 
 

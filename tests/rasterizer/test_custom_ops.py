@@ -143,7 +143,8 @@ def test_half_precision_is_cast_under_autocast():
     half = leaves[4].detach().bfloat16()
 
     def draw_colors(colors):
-        return rasterize(*[*leaves[:4], colors, *leaves[5:]], WIDTH, HEIGHT).image
+        arguments = [*leaves[:4], colors, *leaves[5:]]
+        return rasterize(*arguments, WIDTH, HEIGHT).image
 
     draw = torch.compile(draw_colors, backend="eager")
     with torch.autocast("cpu", dtype=torch.bfloat16):

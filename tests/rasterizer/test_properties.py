@@ -62,10 +62,12 @@ def test_one_gaussian_of_any_numbers_leaves_the_others_alone(data):
     good[3] = torch.where(good[3].isfinite(), good[3].clamp(0, 1), good[3])
     leaves = [part.clone().requires_grad_() for part in good]
     inputs = [leaves[0], leaves[1], leaves[2], leaves[3][:, 0], leaves[4]]
-    rendering = rasterize(*[*inputs, *camera()], 18, 14)
+    arguments = [*inputs, *camera(), 18, 14]
+    rendering = rasterize(*arguments)
     others = torch.arange(COUNT) != 2
     if not bool(rendering.visible[2]):
-        without = rasterize(*[*(part[others] for part in inputs), *camera()], 18, 14)
+        arguments[:5] = (part[others] for part in inputs)
+        without = rasterize(*arguments)
         assert torch.equal(rendering.image, without.image)
         rendering.image.sum().backward()
         assert all(bool(leaf.grad[others].isfinite().all()) for leaf in leaves)

@@ -168,13 +168,14 @@ def test_function_transforms_and_forward_mode_are_refused_by_a_sentence(name):
 def test_autocast_casts_half_precision_and_without_it_the_argument_is_named(half):
     leaves = splats(dtype=torch.float32)
     halves = [leaf.detach().to(half).requires_grad_() for leaf in leaves[:5]]
+    arguments = [*halves, *leaves[5:]]
     with pytest.raises(ValueError, match=f"means is {half}, expected torch.float32"):
-        rasterize(*[*halves, *leaves[5:]], WIDTH, HEIGHT)
+        rasterize(*arguments, WIDTH, HEIGHT)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        image = rasterize(*[*halves, *leaves[5:]], WIDTH, HEIGHT).image
+        image = rasterize(*arguments, WIDTH, HEIGHT).image
         assert torch.is_autocast_enabled("cpu")
     image.sum().backward()
-    truth = rasterize(*[*(leaf.detach().float() for leaf in halves), *leaves[5:]], WIDTH, HEIGHT).image
+    truth = rasterize(*(argument.detach().float() for argument in arguments), WIDTH, HEIGHT).image
     assert image.dtype == torch.float32 and torch.equal(image, truth)
     assert all(leaf.grad is not None and leaf.grad.dtype == half for leaf in halves)
 
@@ -182,7 +183,8 @@ def test_autocast_casts_half_precision_and_without_it_the_argument_is_named(half
 def test_inputs_that_are_not_contiguous_or_expanded_give_the_same(device):
     leaves = [leaf.detach() for leaf in splats(device, torch.float32)]
     count = len(leaves[0])
-    truth = rasterize(*[*leaves[:3], leaves[3][:1].repeat(count), *leaves[4:]], WIDTH, HEIGHT)
+    repeated = [*leaves[:3], leaves[3][:1].repeat(count), *leaves[4:]]
+    truth = rasterize(*repeated, WIDTH, HEIGHT)
     strided = [torch.stack([leaf, leaf], dim=-1)[..., 0] for leaf in leaves]
     strided[3] = leaves[3][:1].expand(count)
     assert not strided[0].is_contiguous()

@@ -1,4 +1,4 @@
-"""What speaks for a candidate, part by part."""
+"""Score of a candidate response, part by part."""
 
 import numpy as np
 import pytest

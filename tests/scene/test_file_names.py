@@ -32,7 +32,7 @@ def test_names_of_windows_and_in_latin_1(tmp_path, binary):
 
 @pytest.mark.parametrize("suffix, stored", [(".PNG", ".png"), (".jpg", ".png"), (".jpg", ".exr")])
 def test_photos_under_another_suffix_than_the_model_states(tmp_path, suffix, stored):
-    """As after a conversion, or structure from motion on JPEGs of an OpenEXR set."""
+    """Conversion causes this, and so does structure from motion on JPEGs of an OpenEXR set."""
     import OpenEXR
 
     write_colmap(tmp_path)

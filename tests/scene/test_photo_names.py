@@ -1,4 +1,4 @@
-"""Which masks, truth and times belong to a photo, by its path or its name alone."""
+"""Masks, truth and times of a photo, matched by its path or its name alone."""
 
 import json
 

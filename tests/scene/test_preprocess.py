@@ -11,7 +11,7 @@ from tests.make_scenes import edit_transforms, load, pattern, write_blender, wri
 
 
 def test_photos_are_averaged_side_by_side(tmp_path):
-    """In a new process, whose kernels are not loaded yet: eight threads that load one at once end it."""
+    """Run a new process, whose kernels are not loaded yet: eight threads that load one at once end it."""
     write_colmap(tmp_path, count=16)
     code = f"from sehdr_warp.scene import load_scene; load_scene({str(tmp_path)!r}, max_size=24, response='hdr-nerf')"
     environment = os.environ | {"SEHDR_THREADS": "8"}

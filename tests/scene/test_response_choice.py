@@ -41,7 +41,7 @@ def test_photos_of_several_cameras_are_told_of(tmp_path, cameras, notes):
 
 
 def test_the_response_is_chosen_from_codes_as_photographed():
-    """At any size the same photos are judged, as smaller ones tell too little; another curve develops otherwise."""
+    """Photos of any size are judged at one size, as smaller ones tell too little; another curve develops otherwise."""
     candidates = "srgb", "camera", "rec709", "filmic"
     scenes = [load_scene("embedded", max_size=size, candidates=candidates) for size in (None, 40)]
     for scene in scenes:

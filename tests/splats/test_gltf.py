@@ -46,7 +46,7 @@ def test_glb_is_laid_out_as_the_extension_says(tmp_path):
 
 
 def test_glb_of_normalized_integers_and_strides_is_read(tmp_path):
-    """As other writers quantize."""
+    """Other writers quantize in this way."""
     write_gaussians(tmp_path / "a.glb", gaussians(2, 0, "display"))
 
     def quantize(described):

@@ -1,4 +1,4 @@
-"""What a training writes beside its state: figures, checkpoints, lines."""
+"""Files and lines of a training beside its state: figures, checkpoints, log."""
 
 import dataclasses
 import sys

@@ -1,4 +1,4 @@
-"""What is measured of a scene before its training."""
+"""Figures of a scene that are measured before its training."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What a photo stands for on the scale on which renders are compared with it."""
+"""Targets of a photo on the scale on which renders are compared with it."""
 
 import math
 from dataclasses import replace

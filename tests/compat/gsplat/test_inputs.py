@@ -67,7 +67,8 @@ def test_wrong_shapes_types_and_devices_are_named():
         with pytest.raises((ValueError, TypeError), match=message):
             rasterization(*arguments)
     with pytest.raises(ValueError, match=r"viewmats has shape \[0, 2, 4, 4\], which has no camera"):
-        rasterization(*[*(tensor[None][:0] for tensor in (*leaves, *place[:2])), *place[2:]])
+        none = place._replace(viewmats=place.viewmats[None][:0], Ks=place.Ks[None][:0])
+        rasterization(*(leaf[None][:0] for leaf in leaves), **none._asdict())
 
 
 @pytest.mark.parametrize("options", [{}, {"camera_model": "ortho"}, {"sh_degree": 1}])
@@ -76,9 +77,9 @@ def test_inputs_that_are_not_contiguous_give_the_same(options, device):
     truth, _, _ = rasterization(*leaves, **place._asdict(), **options)
     expected = gradients(truth, leaves)
     strided = [torch.stack([leaf.detach()] * 2, dim=-1)[..., 0].requires_grad_() for leaf in leaves]
-    transposed = [tensor.mT.contiguous().mT for tensor in place[:2]]
-    assert not any(tensor.is_contiguous() for tensor in (*strided, *transposed))
-    colors, _, _ = rasterization(*[*strided, *transposed], WIDTH, HEIGHT, **options)
+    transposed = place._replace(viewmats=place.viewmats.mT.contiguous().mT, Ks=place.Ks.mT.contiguous().mT)
+    assert not any(tensor.is_contiguous() for tensor in (*strided, *transposed[:2]))
+    colors, _, _ = rasterization(*strided, **transposed._asdict(), **options)
     assert torch.equal(colors, truth)
     for mine, its in zip(gradients(colors, strided), expected, strict=True):
         torch.testing.assert_close(mine, its, rtol=1e-5, atol=1e-4)  # A GPU adds in another order each time.
@@ -131,7 +132,8 @@ def test_sizes_of_nothing_and_opacities_beyond_one_are_gsplats(device):
     with torch.no_grad():
         leaves[2][1] = -leaves[2][1]
     torch.testing.assert_close(rasterization(*leaves, **place._asdict())[0], colors)
-    truth, _, _ = rasterization(*[*(each.double() for each in (*leaves, *place[:2])), *place[2:]])
+    exact = place._replace(viewmats=place.viewmats.double(), Ks=place.Ks.double())
+    truth, _, _ = rasterization(*(leaf.double() for leaf in leaves), **exact._asdict())
     torch.testing.assert_close(colors.double(), truth, rtol=1e-4, atol=1e-4)
 
 

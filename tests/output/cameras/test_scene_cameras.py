@@ -1,4 +1,4 @@
-"""Where a scene's cameras look."""
+"""Points and directions that a scene's cameras look at."""
 
 import numpy as np
 

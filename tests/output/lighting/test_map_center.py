@@ -1,4 +1,4 @@
-"""Where a map is rendered from, and what it leaves out."""
+"""Center of an environment map, and what the map leaves out."""
 
 import json
 

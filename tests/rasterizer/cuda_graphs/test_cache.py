@@ -91,9 +91,10 @@ def test_renders_neither_use_nor_change_memory_that_was_freed(options, different
     for call in range(4 * CALLS):
         with torch.set_grad_enabled(differentiable):
             moved = [tensor * (1.0 - 1e-3 * call) for tensor in tensors[:5]]
-            rendering = rasterize(*[*moved, *tensors[5:]], width, height, **options)
+            arguments = [*moved, *tensors[5:], width, height]
+            rendering = rasterize(*arguments, **options)
         assert all(bool(other.isnan().all()) for other in others)
-        assert_alike([rendering.image.detach()], [launched(*[*moved, *tensors[5:]], width, height, **options).image])
+        assert_alike([rendering.image.detach()], [launched(*arguments, **options).image])
         images = rendering.image, rendering.transmittance
         others = [torch.full_like(like, torch.nan) for like in (*tensors, *images) for _ in range(4)]
         del moved, rendering, images
@@ -259,8 +260,9 @@ def test_options_that_equal_those_of_known_calls_are_checked_as_well():
     for _ in range(CALLS):
         rasterize(*scene.arguments)
     for wrong in ((float(width), height), (width, float(height))):
+        arguments = [*tensors, *wrong]
         with pytest.raises(TypeError, match="expected a whole number"):
-            rasterize(*[*tensors, *wrong])
+            rasterize(*arguments)
     for eps2d in (torch.tensor(EPS2D, dtype=torch.float64), np.array([EPS2D])):
         with pytest.raises(TypeError, match="expected a number"):
             rasterize(*tensors, width, height, eps2d=eps2d)

@@ -169,7 +169,7 @@ def test_exr_among_photos_is_refused_and_beside_one_is_truth(tmp_path):
 
 
 def test_frames_without_photos_are_left_out_and_named(tmp_path):
-    """As in the published fox set: 17 of 67 frames have no photo."""
+    """The published fox set is like this: 17 of 67 frames have no photo."""
     write_blender(tmp_path, 9)
     for i in (1, 4, 8):
         (tmp_path / "images" / f"r_{i}.png").unlink()

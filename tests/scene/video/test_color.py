@@ -1,4 +1,4 @@
-"""What a stream says of its colors, and light beyond Rec.709."""
+"""Colors that a stream states, and light beyond Rec.709."""
 
 from dataclasses import replace
 
