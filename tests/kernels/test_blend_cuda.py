@@ -13,7 +13,7 @@ from sehdr_warp.rasterizer import blending, blending_cuda, tile_lists
 from sehdr_warp.rasterizer.blending import blend
 from sehdr_warp.rasterizer.blending_cuda import BlockBackward, blend_on_cuda
 
-from .test_blend_cpu import BOUNDS, assert_blend_is_the_reference, crowded, leaves_and_lists
+from .test_blend_cpu import BOUNDS, assert_blend_is_the_reference, crowd, leaves_and_lists
 
 THRESHOLD = 1.0 / 255.0
 
@@ -46,14 +46,14 @@ def test_more_gradients_than_int32_counts_are_refused_in_a_fixed_order():
 @pytest.mark.parametrize("channels, deterministic", [(1, False), (3, False), (3, True), (9, False)])
 def test_they_are_the_reference(blocks, device, dtype, channels, deterministic, monkeypatch):
     monkeypatch.setattr(blending, "blend_on_cpu", partial(blend_on_cuda, deterministic=deterministic))
-    scene, run = crowded(channels), blocks if device == "cpu" else lambda task: task()
+    scene, run = crowd(channels), blocks if device == "cpu" else lambda task: task()
     ranges = leaves_and_lists(scene, THRESHOLD)[1].tile_ranges
     assert int((ranges[:, 1] - ranges[:, 0]).max()) > 64  # Queues spill over 32.
     assert_blend_is_the_reference(scene, dtype, device, run=run, deterministic=deterministic)
 
 
 def test_a_single_pixels_gradient_may_have_any_strides(blocks):
-    scene = crowded(1, width=1, height=1).to(torch.float32, "cpu")
+    scene = crowd(1, width=1, height=1).to(torch.float32, "cpu")
     leaves, lists, splats = leaves_and_lists(scene, THRESHOLD)
     image = blocks(lambda: blend(leaves, lists, splats, THRESHOLD))[0]
     blocks(image.sum().backward)
@@ -63,7 +63,7 @@ def test_a_single_pixels_gradient_may_have_any_strides(blocks):
 def test_nothing_more_by_gaussian_is_kept_for_the_backward_pass(blocks, monkeypatch):
     monkeypatch.setenv("KINETO_LOG_LEVEL", "99")  # the profiler's own messages
     monkeypatch.setattr(blending_cuda, "MAX_SINGLE_SORT", 0)  # few are kept padded
-    scene = crowded(3).to(torch.float32, "cpu")
+    scene = crowd(3).to(torch.float32, "cpu")
     leaves, lists, splats = leaves_and_lists(scene, THRESHOLD)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recorded:
         image = blocks(lambda: blend(leaves, lists, splats, THRESHOLD))[0]
