@@ -52,8 +52,8 @@ def write_reports(folder: Path) -> list[Path]:
         pages.append(_write(folder / "tried.md", _tried_page(folder / "tried.csv")))
         index.append({"report": "[Negative results](tried.md)"})
     text = (
-        "What was measured. `python -m benchmarks.measure PAGE` measures a page again. "
-        "`python -m benchmarks.report_pages` writes pages and the README's table from the results."
+        "Measurements, each with its commands, machine and build. `python -m benchmarks.measure PAGE` measures a page "
+        "again. `python -m benchmarks.report_pages` writes the pages and the README's table from the results."
     )
     table = markdown_table(index, {"report": "", "machine": "", "build": ""})
     return [*pages, _write(folder / "README.md", ["# Reports", text, table])]
@@ -85,11 +85,19 @@ def _tried_page(path: Path) -> list[str]:
         topics = groups(csv.DictReader(file), "topic")
     columns: dict[str, str] = dict.fromkeys(("option", "idea", "gave", "on"), "")
     text = (
-        "Ideas that were built, measured and taken out again, or never turned on. dB are differences in "
-        "held-out mu-law PSNR under `gt-max` to the same training without, where nothing else is said; 0.2 dB are "
-        "within seed variance. 21.3 (21.0) is 21.3 in place of 21.0. Fields that `sehdr-warp config` does not list "
-        "were removed again. Rooms and exposures 0 to 4 are those of [synthetic scenes](../synth.md), captures those "
-        "of [their page](captures.md), and the prior is that for [clipped light](../light-prior.md)."
+        "Ideas that were built and measured, and that did not become the default: they were removed, or are options "
+        "that are off. Some rows end with what was adopted instead.\n\n"
+        "- *option*: the config field or the change; fields that `sehdr-warp config` does not list were removed again. "
+        "*idea*: why it might help. *gave*: the result. *on*: scenes and protocol.\n"
+        "- Unless a row says otherwise, dB are differences of held-out mu-law PSNR (`gt-max`) to the same training "
+        "without the change. Differences below 0.2 dB are within seed variance. 21.3 (21.0) is 21.3 with the change "
+        "and 21.0 without. Means without another word are over scenes.\n"
+        "- *photos*: PSNR of simulated photos. *irradiance*: mean error of the light that surfaces would receive. "
+        "*lights lost*: lights that most held-out views render with less than half of their radiance "
+        "([quality](quality.md)). *planned*: by the rules of [the plan](../plan.md).\n"
+        "- *Rooms* are the eight rendered scenes of [synthetic scenes](../synth.md) with their exposures 0 (darkest) "
+        "to 4, of which 2 is the middle one. *Captures* are the real photos of [their page](captures.md). *The prior* "
+        "is the network that estimates [clipped light](../light-prior.md)."
     )
     tables = [part for (topic,), rows in topics.items() for part in (f"## {topic}", markdown_table(rows, columns))]
     return ["# Negative results", text, *tables]

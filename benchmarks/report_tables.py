@@ -165,7 +165,7 @@ def _stability_tables(result: dict) -> Iterable[str]:
             line["median"] = median(part for part, _ in parts)
         lines.append(line)
     failed = [row["case"] for row in result["rows"] if not row["holds"]]
-    yield "Errors over their bounds:"
+    yield "Errors divided by their bounds:"
     columns = {"group": "", "cases": "d", "bounds": "d", "median": ".2f", "worst": ".2f", "which": ""}
     yield markdown_table(lines, columns)
     yield markdown_table(result["rows"], {"case": "", "what": "", "note": ""})
@@ -189,9 +189,10 @@ def _trust_tables(result: dict) -> Iterable[str]:
         counts = ("cases", "held", "mended", "failing")
         rows = [dict(row) for row in result["outsider"]]
         total = {"family": "all"} | {name: sum(row[name] for row in rows) for name in counts}
-        yield "## Cases of an outsider"
-        yield "Written without knowledge of sources and trial. *held*: passed at first, *failing*: after corrections."
-        yield markdown_table([*rows, total], {"family": "", **dict.fromkeys(counts, "d"), "found": ""})
+        yield "## Independent cases"
+        yield "Written by someone who knew neither the code nor the trial. *failing*: after the corrections."
+        columns = {"family": "", "cases": "d", "passed=held": "d", "corrected=mended": "d", "failing": "d", "found": ""}
+        yield markdown_table([*rows, total], columns)
     if "fuzz" in result:
         counts, rows = ("inputs", "findings"), []
         for (reader,), each in groups(result["fuzz"], "reader").items():
@@ -199,14 +200,17 @@ def _trust_tables(result: dict) -> Iterable[str]:
             rows.append({"reader": reader, "seeds": seeds} | {name: sum(row[name] for row in each) for name in counts})
         rows.append({"reader": "all"} | {name: sum(row[name] for row in rows) for name in counts})
         yield "## Damaged files"
-        yield "Made by `python -m tests.fuzz`. A finding is anything but a refusal in one line."
+        yield "Made by `python -m tests.fuzz`. A finding is anything but a normal read or a refusal in one line."
         yield markdown_table(rows, {"reader": "", "inputs": ",d", "seeds": "", "findings": "d"})
 
 
 def _relight_tables(result: dict) -> Iterable[str]:
     rows = [row | {"lit by": f"{row['method']}, {row['by']}"} for row in result["rows"]]
-    for title, field, form in (("Pixels, mean difference over the mean", "off", ".0%"), ("Light", "energy", ".2f")):
-        yield f"## {title} of the truth"
+    for title, field, form in (
+        ("Difference of pixels, over the mean of the truth", "off", ".0%"),
+        ("Light of all pixels, over that of the truth", "energy", ".2f"),
+    ):
+        yield f"## {title}"
         yield pivot(rows, {"room=scene": "", "exposure": "d"}, "lit by", field, form)
 
 
