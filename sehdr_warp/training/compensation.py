@@ -1,7 +1,7 @@
 """Decide whether a camera changed exposure, white balance or vignetting between photos without stating it.
 
 The evidence is the light of points that several photos show: the gains that explain its differences are estimated by
-scene.exposure.compensation, and only the components that clearly explain them are corrected.
+scene.exposure.matched_points, and only the components that clearly explain them are corrected.
 """
 
 from collections.abc import Sequence
@@ -15,15 +15,8 @@ import torch
 from ..response import Response
 from ..runs.config import Config
 from ..scene import Scene, View
-from ..scene.exposure.compensation import (
-    ExposureCompensation,
-    disagreement,
-    fit_gains,
-    initial_gains,
-    remaining_vignetting,
-    rough_gains,
-    unmeasured_reach,
-)
+from ..scene.exposure.compensation import ExposureCompensation
+from ..scene.exposure.matched_points import MatchedPoints, initial_gains
 from ..subsets import counted, first_names
 from .initialization import make_matcher
 from .matching import Matcher, at_matching_size
@@ -50,38 +43,6 @@ harmonics represent it."""
 CHANGED_LIGHT = 0.5  # Stops between a photo and what it states, relative to the median photo, from which it is named
 ENOUGH_MATCHES = 0.4  # Fraction of pixels that must match for photos to count as similar in brightness
 MIN_POINTS = 100  # Fewest points for a fit
-
-
-@dataclass(frozen=True)
-class MatchedPoints:
-    """Points that several photos show, and these photos."""
-
-    views: Sequence[View]  # Training views
-    others: Sequence[View]  # Views that no gain is fitted to: they get the median gain
-    points: np.ndarray  # [P, 3] world coordinates
-    visible: np.ndarray  # [V + others, P] bool: which views show which points
-    response: Response
-
-    def __len__(self) -> int:
-        """Return the number of points."""
-        return len(self.points)
-
-    @property
-    def observations(self) -> tuple[Sequence[View], np.ndarray, np.ndarray, Response]:
-        """The first arguments of the functions of scene.exposure.compensation."""
-        return self.views, self.points, self.visible, self.response
-
-    def fit(self) -> ExposureCompensation:
-        """Return the gains by which the photos agree best."""
-        return fit_gains(self.views, self.others, self.points, self.visible, self.response)
-
-    def disagreement(self, gains: ExposureCompensation | None, *, colors: bool = False) -> float:
-        """Return the median disagreement of photos at the points after a correction, stops."""
-        return disagreement(*self.observations, gains, colors=colors)
-
-    def every_other(self, first: int) -> "MatchedPoints":
-        """Return half of the points, from number `first` on, without the other views."""
-        return replace(self, others=(), points=self.points[first::2], visible=self.visible[:, first::2])
 
 
 class Components(NamedTuple):
@@ -171,10 +132,10 @@ def estimate_compensation(
 
 def _may_drift(matched: MatchedPoints) -> bool:
     """Return whether photos with stated times may drift, by a rough fit to few points."""
-    rough = rough_gains(*matched.observations)
+    rough = matched.rough_fit()
     if _exceeds_stated(rough, matched.views):
         return True
-    return rough.corner_loss >= MIN_CORNER_LOSS and remaining_vignetting(*matched.observations, rough) < 1
+    return rough.corner_loss >= MIN_CORNER_LOSS and matched.remaining_vignetting(rough) < 1
 
 
 def _explanatory_components(
@@ -184,7 +145,7 @@ def _explanatory_components(
 
     Exposure that photos state is corrected only by what explains other points than those of its fit, too.
     """
-    views, before = matched.views, matched.disagreement(None)
+    views, before = matched.views, matched.disagreement()
     after = matched.disagreement(compensation.parts(vignetting=False))
     explains = before >= MIN_DISAGREEMENT and after <= MAX_REMAINING * before
     exposure = white_balance = not times_known and compensation.stops >= MIN_STOPS and explains
@@ -227,15 +188,15 @@ def _cross_validate(matched: MatchedPoints) -> Remaining:
         fit = fitted.fit()
         drift = fit.parts(vignetting=False)
         exposure = rest.disagreement(drift), rest.disagreement(drift.explained_part(matched.views))
-        colors = rest.disagreement(drift.parts(exposure=False), colors=True), rest.disagreement(None, colors=True)
-        vignetting = remaining_vignetting(*rest.observations, fit)
+        colors = rest.disagreement(drift.parts(exposure=False), colors=True), rest.disagreement(colors=True)
+        vignetting = rest.remaining_vignetting(fit)
         remaining.append([*(after / before if before else 1.0 for after, before in (exposure, colors)), vignetting])
     return Remaining(*np.mean(remaining, 0).tolist())
 
 
 def _reach_note(matched: MatchedPoints) -> str:
     """Return the end of the plan's line about photos whose vignetting is left out; empty if there are none."""
-    count, reach = unmeasured_reach(*matched.observations)
+    count, reach = matched.unmeasured_reach()
     if not count:
         return ""
     return f"; vignetting of {count} photos is left out: their points reach {reach:.0%} of the way to the corners"

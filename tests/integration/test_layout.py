@@ -28,6 +28,7 @@ ELSEWHERE = {
     "with what calls them, in other tests of their folder": [
         "blocks/seams", "check/*", "prior/network", "rasterizer/caller_lists",
         "rasterizer/cuda_graphs/render_graph", "rasterizer/warp_launch/loading", "rasterizer/warp_launch/packing",
+        "scene/exposure/matched_points",
     ],
     "on the command line": ["evaluation/commands", "runs/commands", "scene/commands", "training/commands"],
     "as what tests compare with": ["rasterizer/reference"],

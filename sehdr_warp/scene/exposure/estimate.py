@@ -9,7 +9,7 @@ from ...response import Response
 from ...subsets import every_nth, first_names
 from ..images.exif import LONGEST, SHORTEST
 from ..types import Scene, View
-from .compensation import initial_gains, point_light
+from .matched_points import initial_gains, point_light
 from .times import shutter
 
 _FEWEST = 20  # Points that photos have to share
@@ -61,7 +61,7 @@ def _factor(view: View, timed: list[View], points: np.ndarray, response: Respons
     points = points[:: max(1, len(points) // _MOST)]
     if len(points):
         visible = np.ones((1 + len(timed), len(points)), bool)
-        light, _ = point_light([view, *timed], points, visible, response)
+        light = point_light([view, *timed], points, visible, response).logarithms
         shared = np.isfinite(light[0]) & np.isfinite(light[1:]).any(0)  # [P, 3]
         count = int(shared.any(1).sum())
         if count >= _FEWEST:

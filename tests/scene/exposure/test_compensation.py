@@ -9,17 +9,8 @@ from PIL import Image
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of, photo_storage
 from sehdr_warp.scene.camera import look_at
-from sehdr_warp.scene.exposure.compensation import (
-    BAND_ROWS,
-    ExposureCompensation,
-    disagreement,
-    fit_gains,
-    initial_gains,
-    lens_groups,
-    remaining_vignetting,
-    rough_gains,
-    unmeasured_reach,
-)
+from sehdr_warp.scene.exposure.compensation import BAND_ROWS, ExposureCompensation
+from sehdr_warp.scene.exposure.matched_points import MatchedPoints, initial_gains, lens_groups
 
 SIZE, PHOTOS = 48, 6
 SRGB = response_by_name("srgb")
@@ -71,21 +62,22 @@ def test_gains_and_falloff_are_found(gains, points):
     hidden, visible = points.copy(), np.ones((PHOTOS, len(points)), bool)
     hidden[::10, 2] = 2.0  # points that are none
     hidden[1::2, 2], visible[1:, 1::2] = 7.0, False  # behind the wall, and known to be
-    fitted = fit_gains(scene.train_views, scene.test_views, hidden, visible, SRGB)
+    matched = MatchedPoints(scene.train_views, scene.test_views, hidden, visible, SRGB)
+    fitted = matched.fit()
     for name, gain in gains.items():
         np.testing.assert_allclose(fitted.gains[name], gain, rtol=0.02)
     assert fitted.corner_loss == pytest.approx(1 - np.exp(-sum(VIGNETTING)), abs=0.03)
     assert fitted.stops > 0.3
     rough = initial_gains(scene.train_views, SRGB)
     np.testing.assert_allclose([rough.gains[v.name] for v in scene.train_views], list(gains.values())[:-1], rtol=0.25)
-    rough, known = rough_gains(scene.train_views, hidden, visible, SRGB), (scene.train_views, hidden, visible, SRGB)
+    rough = matched.rough_fit()
     assert (rough.stops, rough.white_balance) == pytest.approx((fitted.stops, fitted.white_balance), rel=0.15)
     assert rough.corner_loss == pytest.approx(fitted.corner_loss, abs=0.1)
     for colors in (False, True):
-        before, after = (disagreement(*known, corrected, colors=colors) for corrected in (None, fitted))
+        before, after = (matched.disagreement(corrected, colors=colors) for corrected in (None, fitted))
         assert after < 0.1 * before
     wrong = replace(fitted, vignetting=everywhere((0.0, 0.8)))
-    assert remaining_vignetting(*known, fitted) < 0.15 and remaining_vignetting(*known, wrong) > 0.8
+    assert matched.remaining_vignetting(fitted) < 0.15 and matched.remaining_vignetting(wrong) > 0.8
 
 
 @pytest.mark.parametrize("cause", ["times", "places"])
@@ -111,27 +103,29 @@ def test_what_follows_stated_times_or_places_is_told_apart(cause):
 def test_each_lens_has_its_falloff(gains, points):
     dark = everywhere(VIGNETTING, range(0, PHOTOS, 2))
     scene = photographed(gains, dark, lambda name: 60.0 if name in dark else 70.0)
-    views, visible = scene.train_views, np.ones((PHOTOS, len(points)), bool)
-    fitted = fit_gains(views, scene.test_views, points, visible, SRGB)
+    visible = np.ones((PHOTOS, len(points)), bool)
+    matched = MatchedPoints(scene.train_views, scene.test_views, points, visible, SRGB)
+    fitted = matched.fit()
     corners = {name: 1 - np.exp(-sum(fitted.vignetting.get(name, (0, 0)))) for name in gains}
     for name, lacking in corners.items():
         assert lacking == pytest.approx(1 - np.exp(-sum(dark.get(name, (0, 0)))), abs=0.03)
-    rough = rough_gains(views, points, visible, SRGB)
-    assert rough.corner_loss == pytest.approx(fitted.corner_loss, abs=0.1)
-    assert remaining_vignetting(views, points, visible, SRGB, fitted) < 0.15
+    assert matched.rough_fit().corner_loss == pytest.approx(fitted.corner_loss, abs=0.1)
+    assert matched.remaining_vignetting(fitted) < 0.15
 
 
 def test_a_falloff_is_not_extrapolated_from_the_middle_of_photos(gains, points):
     scene = photographed(gains, everywhere(VIGNETTING))
     views, visible = scene.train_views, np.ones((PHOTOS, len(points)), bool)
-    assert unmeasured_reach(views, points, visible[:-1], SRGB) == (0, 0)
+    matched = MatchedPoints(views, scene.test_views, points, visible, SRGB)
+    assert matched.unmeasured_reach() == (0, 0)
     places = [view.camera.project(points) for view in scene.views]
     middle = np.array(
         [np.hypot(place.row - SIZE / 2, place.column - SIZE / 2) < 0.5 * np.hypot(24, 24) for place in places]
     )
-    count, reach = unmeasured_reach(views, points, middle[:-1], SRGB)
+    matched = replace(matched, visible=middle)
+    count, reach = matched.unmeasured_reach()
     assert count == PHOTOS - 1 and 0.4 < reach < 0.5
-    for fitted in (fit_gains(views, scene.test_views, points, middle, SRGB), rough_gains(views, points, middle, SRGB)):
+    for fitted in (matched.fit(), matched.rough_fit()):
         assert fitted.corner_loss == 0
         for view in views:
             np.testing.assert_allclose(fitted.gains[view.name], gains[view.name], rtol=0.06)
