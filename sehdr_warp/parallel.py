@@ -93,20 +93,24 @@ def run_interruptibly(function: Callable[[], Result], waiting: Callable[[], None
                 waiting()
                 waiting = None
     except BaseException as error:
-        code = error.code if isinstance(error, SystemExit) else 130 if isinstance(error, KeyboardInterrupt) else 1
-        atexit.register(_leave, ended, code if isinstance(code, int) else 1)
+        leave_at_exit(error, ended)
         raise
     return future.result()
 
 
-def _leave(ended: threading.Event, code: int) -> None:
-    """End the process at once if a thread is in native code, which must not run while Python ends."""
-    if not ended.is_set():
-        with suppress(Exception):
-            logging.shutdown()
-            sys.stdout.flush()
-            sys.stderr.flush()
-        os._exit(code)
+def leave_at_exit(error: BaseException, ended: threading.Event | None = None) -> None:
+    """Let Python end at once after an error, without waiting for native code, unless `ended` is set by then."""
+    code = 130 if isinstance(error, KeyboardInterrupt) else error.code if isinstance(error, SystemExit) else 1
+
+    def leave() -> None:
+        if ended is None or not ended.is_set():
+            with suppress(Exception):
+                logging.shutdown()
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(code if isinstance(code, int) else 1)
+
+    atexit.register(leave)
 
 
 @contextmanager

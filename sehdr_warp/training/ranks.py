@@ -24,7 +24,7 @@ from torch import Tensor
 from ..errors import SehdrError, as_user_error
 from ..model.adam import Adam
 from ..model.gaussians import Gaussians
-from ..parallel import WAITING_NOTICE, run_interruptibly, thread_count
+from ..parallel import WAITING_NOTICE, leave_at_exit, run_interruptibly, thread_count
 from ..scene.photo_storage import PhotoFile, can_share, open_shared
 from .launch import RankInfo, installed_versions, open_store
 from .strategies import Strategy
@@ -331,7 +331,7 @@ def join_ranks(info: RankInfo, device: torch.device) -> Iterator[Ranks]:
         ranks.close()
     except BaseException as error:
         ranks.stop_watching()
-        _end_soon(error)
+        leave_at_exit(error)  # Cleanup would wait for ranks that have ended.
         first, message = ranks.ends_first(), isinstance(error, Exception) and as_user_error(error)
         if message and not first:
             raise SystemExit(1) from None
@@ -340,17 +340,3 @@ def join_ranks(info: RankInfo, device: torch.device) -> Iterator[Ranks]:
         if info.rank and isinstance(error, KeyboardInterrupt):
             raise SystemExit(130) from None
         raise
-
-
-def _end_soon(error: BaseException) -> None:
-    """Prevent cleanup at the interpreter's exit from waiting for ranks that have ended."""
-    import atexit
-
-    code = 130 if isinstance(error, KeyboardInterrupt) else error.code if isinstance(error, SystemExit) else 1
-
-    def leave() -> None:
-        with suppress(Exception):
-            logging.shutdown()
-        os._exit(code if isinstance(code, int) else 1)
-
-    atexit.register(leave)
