@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..model.gaussians import Gaussians
-from ..model.paged_field import boxes_in_view
+from ..model.paged_field import boxes_around, boxes_in_view
 from ..runs.config_files import override_config
 from ..runs.field import assemble_field
 from ..runs.run_folder import RunFolder
@@ -32,7 +32,6 @@ BAND = 1.0  # Distance from a border, in margins of a block, within which its Ga
 PART = 0.3  # Part of a block's training that is repeated
 LEAST_SHARE = 0.02  # Part of the near Gaussians that a photo must show to be trained on
 BOX = 256  # Consecutive rows, which are neighbors in space, that are rendered or left out together
-DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its box, standard deviations
 
 
 def refine_borders(
@@ -77,13 +76,11 @@ def _border_photos(plan: BlockPlan, index: int, points: np.ndarray) -> Scene | N
 
 def _visible_rows(tensors: Mapping[str, Tensor], plan: BlockPlan, cameras: list[Camera]) -> Tensor:
     """Return which of the merged Gaussians any of the cameras may see: a bool [N]."""
-    means, reach = tensors["means"], DEVIATIONS * tensors["log_scales"].amax(1, keepdim=True).exp()
-    low = torch.stack([part.amin(0) for part in (means - reach).split(BOX)]).double().numpy()
-    high = torch.stack([part.amax(0) for part in (means + reach).split(BOX)]).double().numpy()
+    low, high = boxes_around(tensors["means"], tensors["log_scales"], BOX)
     visible = np.zeros(len(low), bool)
     for camera in cameras:
         visible |= boxes_in_view(plan.normalization.camera(camera), low, high) if camera.is_pinhole else True
-    return torch.from_numpy(visible).repeat_interleave(BOX)[: len(means)]
+    return torch.from_numpy(visible).repeat_interleave(BOX)[: len(tensors["means"])]
 
 
 def _trainer(

@@ -46,10 +46,8 @@ class PagedField(RadianceField):
         self.confidence, self.clipped_stops = field.confidence, field.clipped_stops
         self.photo_filters = field.photo_filters
         self._device, self.budget = device, budget
-        means = field.gaussians.means.detach()
-        reach = DEVIATIONS * field.gaussians.log_scales.detach().amax(1, keepdim=True).exp()
-        self._low = torch.stack([part.amin(0) for part in (means - reach).split(CELL)]).double().numpy()
-        self._high = torch.stack([part.amax(0) for part in (means + reach).split(CELL)]).double().numpy()
+        tensors = field.gaussians.tensors()
+        self._low, self._high = boxes_around(tensors["means"], tensors["log_scales"], CELL)
         self._pages: OrderedDict[tuple[int, int], dict[str, Tensor]] = OrderedDict()
         self._versions: tuple[int, ...] = ()
 
@@ -224,6 +222,14 @@ def coarser(page: dict[str, Tensor]) -> dict[str, Tensor]:
         "harmonics_rest": mean(page["harmonics_rest"]),
     }
     return {name: tensor.to(torch.float32) for name, tensor in values.items()}
+
+
+def boxes_around(means: Tensor, log_scales: Tensor, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners [B, 3] float64, low and high, of boxes that each hold `size` consecutive Gaussians."""
+    reach = DEVIATIONS * log_scales.amax(1, keepdim=True).exp()
+    low = torch.stack([part.amin(0) for part in (means - reach).split(size)]).double().numpy()
+    high = torch.stack([part.amax(0) for part in (means + reach).split(size)]).double().numpy()
+    return low, high
 
 
 def boxes_in_view(camera: Camera, low: np.ndarray, high: np.ndarray) -> np.ndarray:
