@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from ..errors import InputError
 from ..subsets import every_nth
 from .color.primaries import srgb_to_linear
-from .images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, open_image
+from .images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, grey_thumbnail
 from .types import View
 
 _MOST_BITS_UNSCALED = 14  # Of sensors, whose codes some programs store in 16 bits as they are
@@ -63,7 +62,7 @@ def frame_notes(photos: Sequence[Path], *, masked: bool = False) -> tuple[str, .
     if any(photo.suffix.lower() not in LDR_SUFFIXES for photo in photos):
         return ()
     try:
-        pictures = [_thumbnail(photo) for photo in every_nth(photos, _JUDGED)]
+        pictures = [grey_thumbnail(photo, _SIDE) for photo in every_nth(photos, _JUDGED)]
     except (InputError, *PILLOW_ERRORS):
         return ()  # The readers of these photos report what is wrong with them.
     outside, inside = np.median([_around_circle(codes) for codes in pictures], axis=0)
@@ -76,14 +75,6 @@ def frame_notes(photos: Sequence[Path], *, masked: bool = False) -> tuple[str, .
             note = f"photos have {color} bars ({', '.join(bars)}), which become part of the scene"
             return (f"{note}: crop them off, or leave them out by a mask.png that is black there",)
     return ()
-
-
-def _thumbnail(photo: Path) -> np.ndarray:
-    with open_image(photo) as image:
-        image.draft("L", (2 * _SIDE, 2 * _SIDE))
-        small = image.convert("L")
-        small.thumbnail((_SIDE, _SIDE), Image.Resampling.BOX)
-        return np.asarray(small)
 
 
 def _around_circle(codes: np.ndarray) -> tuple[float, float]:

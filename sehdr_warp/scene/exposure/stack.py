@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PIL import Image
 
 from ...errors import InputError
 from ...progress import track_progress
 from ..dataparser import UNPLACED, ImageRecord
 from ..file_names import list_images
-from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, open_image, read_ldr
+from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, grey_thumbnail, read_ldr
 from .times import shutter, with_exposure_times
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
         return
     try:
         tracked = track_progress("comparing exposures", photos, log)  # Large PNG and TIFF files take a while.
-        pictures = sorted((_thumbnail(photo) for _, photo in tracked), key=np.mean)
+        pictures = sorted((grey_thumbnail(photo, THUMBNAIL) for _, photo in tracked), key=np.mean)
     except (InputError, *PILLOW_ERRORS):
         return  # The readers of these photos report what is wrong with them.
     alike = [each for each in starmap(_likeness, pairwise(pictures)) if each is not None]
@@ -81,14 +80,6 @@ def refuse_stack(photos: Sequence[Path], folder: Path) -> None:
     command = f"`sehdr-warp calibrate {shlex.quote(str(photos[0].parent))} --out camera.csv`"
     remedy = f"take photos from different places; {command} finds the camera's response in the stack"
     raise InputError(folder, problem, remedy)
-
-
-def _thumbnail(photo: Path) -> np.ndarray:
-    with open_image(photo) as image:
-        image.draft("L", (2 * THUMBNAIL, 2 * THUMBNAIL))
-        small = image.convert("L")
-        small.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
-        return np.asarray(small)
 
 
 def _likeness(one: np.ndarray, other: np.ndarray) -> float | None:

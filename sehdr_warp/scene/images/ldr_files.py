@@ -113,6 +113,15 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
     return EncodedImage(turn_upright(pixels, turn), None if alpha is None else turn_upright(alpha, turn))
 
 
+def grey_thumbnail(path: Path, side: int) -> np.ndarray:
+    """Return grey 8-bit codes [h, w] of a photo as it is stored, at most `side` pixels long; raises as Pillow does."""
+    with open_image(path) as image:
+        image.draft("L", (2 * side, 2 * side))
+        small = image.convert("L")
+        small.thumbnail((side, side), Image.Resampling.BOX)
+        return np.asarray(small)
+
+
 def has_16_bits(path: Path) -> bool:
     """Return whether a photo that read_ldr decodes has 16 bits; raises as open_image."""
     with open_image(path) as image:
