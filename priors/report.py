@@ -21,37 +21,45 @@ _COLUMNS = {
 }
 _SETS = {
     "plain": "sRGB, 8 bits, 0.2 to 20 % of the pixels at white",
-    "camera": "random camera curves, white balance, noise, JPEG and exposures; the curve known to a fifth of a stop",
-    "bright lamps": "the same, small lights raised to a random power of up to 2.2",
-    "lights put in": "as camera, with lamps, windows and screens put in",
+    "camera": "random camera curves, white balance, noise, JPEG and exposures; the curve is known to a fifth of a stop",
+    "bright lamps": "the same, with small lights raised to a random power of up to 2.2",
+    "lights put in": "as camera, with inserted lamps, windows and screens",
     "overexposed": "as camera, 10 to 95 % of the pixels at white",
-    "pages": "as camera, with white surfaces put in that are no lamps, blank or printed",
-    "lit rooms": "rendered rooms and streets with lamps in view, other ones than in a training",
+    "pages": "as camera, with inserted white surfaces that are not lamps, blank or printed",
+    "lit rooms": "rendered rooms and streets with lamps in view, not those of a training",
 }
 _AREAS = {"30": "up to 30", "300": "31 to 300", "3000": "301 to 3000", "27648": "more"}
 _TEXT = """# The prior for light above white
 
-How well the network that comes with the package estimates clipped light ([Light above white](light.md)), on photos of
-{panoramas} panoramas that no training used (`checked` and `checked_more` in `priors/sources.toml`), at most 384 for
-each table. Each row estimates the log2 excess over white of clipped values: by nothing (*white*), by the mean of the
-training (*constant*), by a ridge regression on ten figures of the photo's histogram, and by the network. Constant and
-ridge are fitted on the panoramas of the training. RMS counts all clipped values alike. The card beside the weights,
-`sehdr_warp/prior/clipped_light.md`, says how they were trained.
+How well the network that comes with the package estimates the light of clipped pixels ([Light above white](light.md)).
+On plain photos its error is {rms:.2f} stops (RMS); taking clipped light as white, it would be {white:.2f}. In photos by
+real cameras (below), two values in three lie within the deviation that the network states.
+
+The photos are taken from {panoramas} HDR panoramas that no training used (`checked` and `checked_more` in
+`priors/sources.toml`), at most 384 for each table. Each row estimates the excess of clipped values over white, in log2:
+*white* is no excess, *constant* the mean of the training, *ridge* a ridge regression on ten figures of the photo's
+histogram. Constant and ridge are fitted on the panoramas of the training.
+
+- *RMS* is over all clipped values. *spread of a photo's level*: standard deviation over photos of a photo's mean error.
+- *total light*: median over photos of the error of the summed clipped light.
+- *mu-law dB*: PSNR of whole photos, in the mean and for the worst 5 %.
+
+The card beside the weights, `sehdr_warp/prior/clipped_light.md`, says how they were trained.
 
 {tables}
 
 ![Estimates against the truth, and how often the truth lies within a deviation](images/{page}.png)
 
 The truth lies within one deviation of the network for {within:.0%} of the clipped values (`camera`). One factor for
-all deviations was fitted on panoramas of its training. Regions err as a whole, so trainings widen deviations over one
-stop ([how well they hold](light.md#the-cheapest-cures)). By quarters of the deviation, as the network states it:
+all deviations was fitted on panoramas of its training. The values of a region err alike, so trainings widen deviations
+over one stop ([how well they hold](light.md#the-cheapest-cures)). By quarters of the deviation that the network states:
 
 | mean deviation, stops | RMS, stops | within one deviation |
 | -: | -: | -: |
 {quarters}
 
-The mean of a log-normal value, summed, over the sum of the true light, all photos together, by the number of values
-that clip in a photo of 96 x 96 pixels. Trainings count half of the variance, so they expect less:
+Expected light (the mean of the log-normal estimate) divided by true light, summed over all photos, by the number of
+values that clip in a photo of 96 x 96 pixels. Trainings use half of the variance, so they expect less:
 
 | photos | {areas} |
 | --- |{rules}
@@ -60,15 +68,16 @@ that clip in a photo of 96 x 96 pixels. Trainings count half of the variance, so
 ## Photos by real cameras
 
 {photos} photos of {stacks} exposure stacks by other people, which no training used (`python -m priors.brackets`). Each
-stack calibrates its camera, and its darker photos show what clips in the others. Stacks count alike. *RMS* and *bias*
-are of clipped values, in stops; *light* is the median error of their sum, log2.
+stack calibrates its camera, and its darker photos show what clips in the others. All stacks weigh the same. *RMS* and
+*bias* are those of clipped values, in stops; *light* is the median error of their sum, in log2; *of white*: if clipped
+light is taken as white.
 
 | pixels that clip | photos (stacks) | RMS of white | RMS | bias | within one deviation | light of white | light |
 | --- | -: | -: | -: | -: | -: | -: | -: |
 {brackets}
 
-A light's color is hardly known: the estimate has {slope:.2f} of the stops between red and blue (correlation with the
-truth {correlation:.2f}). So lights that clip in all channels come out pale.
+The color of a light is hardly known: the estimate has {slope:.2f} of the true stops between red and blue (correlation
+{correlation:.2f}). So lights that clip in all channels come out pale.
 """
 
 
@@ -93,7 +102,9 @@ def main(figures_file: Path, brackets_file: Path, folder: Path, /) -> None:
     values |= {"brackets": _bracket_rows(brackets["rows"]), **brackets["colors"]}
     photos = [photo["stack"] for photo in brackets["photos"]]
     values |= {"photos": len(photos), "stacks": len(set(photos))}
-    values |= {"panoramas": figures["settings"]["panoramas"]}
+    plain = figures["plain"]
+    values |= {"panoramas": figures["settings"]["panoramas"], "rms": plain["network"]["rms"]}
+    values |= {"white": plain["white"]["rms"]}
     (folder / f"{PAGE}.md").write_text(_TEXT.format(**values))
     _plot(np.array(network["sample"]), folder / "images" / f"{PAGE}.png")
 
