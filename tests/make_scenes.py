@@ -3,7 +3,7 @@
 import json
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,13 @@ def pattern(width: int, height: int, seed: int = 0) -> np.ndarray:
     noise = np.random.default_rng(seed).random((height // 4 + 2, width // 4 + 2, 3))
     picture = Image.fromarray((noise * 255).astype(np.uint8)).resize((width, height), Image.Resampling.BICUBIC)
     return np.asarray(picture)
+
+
+def write_photos(folder: Path, names: Iterable[str], size=(16, 12), seed: int = 0) -> None:
+    """Photos of one size that all show something else, in a folder that is made if it is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, name in enumerate(names):
+        Image.fromarray(pattern(*size, seed + i)).save(folder / name)
 
 
 def png_of(*chunks: tuple[bytes, bytes], head: bytes = b"\x89PNG\r\n\x1a\n") -> bytes:

@@ -18,6 +18,7 @@ from tests.make_scenes import (
     write_blender,
     write_colmap,
     write_llff,
+    write_photos,
     write_reinhard,
 )
 
@@ -285,10 +286,7 @@ def test_masks_in_a_folder_of_each_camera(tmp_path):
 def test_a_mask_of_all_photos_lies_among_bare_photos(tmp_path, place):
     """A photo may have its name."""
     folder = tmp_path / place
-    folder.mkdir(exist_ok=True)
-    for i in range(4):
-        Image.fromarray(pattern(64, 48, i)).save(folder / f"{i}.jpg")
-    Image.fromarray(pattern(64, 48, 5)).save(folder / "mask.png")
+    write_photos(folder, [*(f"{i}.jpg" for i in range(4)), "mask.png"], (64, 48))
     assert [record.view for record in find_photos(tmp_path).records] == ["0", "1", "2", "3", "mask"]
     write_mask(folder / "mask.png", HALF)
     records, _ = assign_masks(find_photos(tmp_path).records, tmp_path)

@@ -11,7 +11,7 @@ from PIL import Image
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.photos import usable_photos
 from sehdr_warp.scene.readers.bare_photos import find_photos
-from tests.make_scenes import load, pattern, png_of, write_colmap
+from tests.make_scenes import load, pattern, png_of, write_colmap, write_photos
 
 
 def write(path: Path, aspect: tuple[int, int], seed: int) -> None:
@@ -69,11 +69,10 @@ def test_stored_pixels_or_turned_ones_as_the_camera_size_says(tmp_path):
 
 def test_images_of_another_shape_than_the_camera_are_left_out(tmp_path):
     write_colmap(tmp_path)
-    for i in range(3):
-        Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / f"{3 + i:03d}.png")
+    write_photos(tmp_path / "images", [f"{3 + i:03d}.png" for i in range(3)], (60, 48))
     expected = "3 of 6 photos cannot be used and were left out (003.png: image is 60 x 48, its camera 64 x 48; "
     assert any(note.startswith(expected) for note in load(tmp_path).notes)
-    Image.fromarray(pattern(60, 48)).save(tmp_path / "images" / "000.png")
+    write_photos(tmp_path / "images", ["000.png"], (60, 48))
     with pytest.raises(InputError, match=r"000.png: image is 60 x 48, its camera 64 x 48"):
         load(tmp_path)
 
@@ -81,8 +80,7 @@ def test_images_of_another_shape_than_the_camera_are_left_out(tmp_path):
 @pytest.mark.parametrize("size", [(26, 19), (200, 150)])
 def test_images_of_any_size_with_the_shape_of_the_camera(tmp_path, size):
     write_colmap(tmp_path)
-    for i in range(6):
-        Image.fromarray(pattern(*size, i)).save(tmp_path / "images" / f"{i:03d}.png")
+    write_photos(tmp_path / "images", [f"{i:03d}.png" for i in range(6)], size)
     camera = load(tmp_path).views[0].camera
     assert (camera.width, camera.height) == size
     assert camera.fx == pytest.approx(50 * size[0] / 64) and camera.cy == pytest.approx(25 * size[1] / 48)

@@ -3,16 +3,14 @@
 import shutil
 
 import pytest
-from PIL import Image
 
 from sehdr_warp.errors import InputError
-from tests.make_scenes import edited_json, load, pattern, said, write_blender, write_colmap
+from tests.make_scenes import edited_json, load, said, write_blender, write_colmap, write_photos
 
 
 def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     write_colmap(tmp_path)
-    for name in ("a.png", "b.jpg"):
-        Image.fromarray(pattern(64, 48)).save(tmp_path / "images" / name)
+    write_photos(tmp_path / "images", ["a.png", "b.jpg"], (64, 48))
     for name in ("clip.xyz", "clip2.xyz", "film.mov", "notes.txt", ".hidden.gif", "IMG.xmp"):
         (tmp_path / "images" / name).write_bytes(b"x")
     scene = load(tmp_path)
@@ -20,8 +18,8 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     assert said(scene, "not read") == [
         "not used, as files of kinds that are not read: 1 MOV (film.mov), 2 XYZ (clip2.xyz ...)"
     ]
-    for i in range(9):  # More than in the model, which was not found for all
-        Image.fromarray(pattern(64, 48)).save(tmp_path / "images" / f"c{i}.png")
+    # More than in the model, which was not found for all
+    write_photos(tmp_path / "images", [f"c{i}.png" for i in range(9)], (64, 48))
     remedy = f"; to find cameras of all photos anew, give {tmp_path / 'images'}"
     assert said(load(tmp_path), "in no view") == [
         "11 photos of images are in no view: a.png, b.jpg, c0.png ..." + remedy
@@ -42,12 +40,10 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
 def test_photos_that_were_not_placed_are_named_in_input_and_beside_images(tmp_path):
     write_colmap(tmp_path, name="{:03d}.png")
     for place, names in ((tmp_path, ["cover"]), (tmp_path / "input", ["000", "005", "100", "101"])):
-        place.mkdir(exist_ok=True)
-        for name in names:
-            Image.fromarray(pattern(64, 48)).save(place / f"{name}.JPG", format="JPEG")
+        write_photos(place, [f"{name}.JPG" for name in names], (64, 48))
     note = f"2 photos of input are in no view: 100.JPG, 101.JPG; to find cameras of all anew, give {tmp_path / 'input'}"
     assert said(load(tmp_path), "in no view") == [note]
-    Image.fromarray(pattern(64, 48)).save(tmp_path / "102.png")
+    write_photos(tmp_path, ["102.png"], (64, 48))
     beside = f"2 photos of {tmp_path.name} are in no view: 102.png, cover.JPG"
     assert said(load(tmp_path), "in no view") == [beside, note]
 
@@ -57,8 +53,7 @@ def test_pictures_of_depth_and_normals_are_named(tmp_path):
     for name in ("Depth", "normals", "hdr"):
         (tmp_path / name).mkdir()
     assert not said(load(tmp_path), "alone")
-    for name in ("Depth/000.png", "Depth/001.png", "normals/000.png"):
-        Image.fromarray(pattern(64, 48)).save(tmp_path / name)
+    write_photos(tmp_path, ["Depth/000.png", "Depth/001.png", "normals/000.png"], (64, 48))
     assert said(load(tmp_path), "alone") == [
         "not used, because depth and normals come from the photos alone: pictures of Depth (2), normals (1)"
     ]
@@ -80,8 +75,7 @@ def test_files_of_cameras_beside_photos_are_named(tmp_path):
 @pytest.mark.parametrize(("count", "others"), [(1, 9), (2, 9), (3, 31)])
 def test_cameras_of_too_few_photos_of_a_folder_name_the_folder(tmp_path, count, others):
     write_colmap(tmp_path, count)
-    for i in range(others):
-        Image.fromarray(pattern(64, 48)).save(tmp_path / "images" / f"c{i}.png")
+    write_photos(tmp_path / "images", [f"c{i}.png" for i in range(others)], (64, 48))
     problem = f"cameras of {count} of {count + others} photos; give {tmp_path / 'images'} to"
     with pytest.raises(InputError, match=problem):
         load(tmp_path)

@@ -17,13 +17,11 @@ from sehdr_warp.scene.readers import bare_photos
 from sehdr_warp.scene.readers.bare_photos import find_photos, inner_folder, with_cameras
 from sehdr_warp.scene.readers.colmap_model import ModelImage, SparseModel
 from sehdr_warp.scene.sfm.reconstruction import Reconstruction, image_name
-from tests.make_scenes import arc_poses, load, pattern, write_blender, write_colmap
+from tests.make_scenes import arc_poses, load, pattern, write_blender, write_colmap, write_photos
 
 
 def photos(folder, count=4, suffix=".jpg"):
-    folder.mkdir(parents=True, exist_ok=True)
-    for i in range(count):
-        Image.fromarray(pattern(16, 12, i)).save(folder / f"IMG_{i}{suffix}")
+    write_photos(folder, [f"IMG_{i}{suffix}" for i in range(count)])
 
 
 def files(folder, *names):
@@ -60,7 +58,7 @@ def test_photos_deep_in_an_export_are_read(tmp_path):
     poly = tmp_path / "poly"
     photos(poly / "keyframes" / "corrected_images")
     photos(poly / "keyframes" / "depth")
-    Image.fromarray(pattern(16, 12)).save(poly / "thumbnail.jpg")
+    write_photos(poly, ["thumbnail.jpg"])
     files(poly, "mesh_info.json")
     remedy = "give .* with photos: keyframes/corrected_images; poses of Polycam"
     with pytest.raises(InputError, match=f"is the only photo there; {remedy}"):
@@ -93,9 +91,7 @@ def test_a_folder_of_more_photos_is_named_beside_two_pictures(tmp_path):
 def test_folders_of_one_camera_are_one_set(tmp_path, names):
     """A memory card: numbers of files begin again in the second folder."""
     for count, name in zip((4, 2), names, strict=True):
-        for i in range(count):
-            (place := tmp_path / "DCIM" / name).mkdir(parents=True, exist_ok=True)
-            Image.fromarray(pattern(16, 12, 5 * count + i)).save(place / f"IMG_{i}.jpg")
+        write_photos(tmp_path / "DCIM" / name, [f"IMG_{i}.jpg" for i in range(count)], seed=5 * count)
     files(tmp_path, "MISC/a.ctg")
     dataset = find_photos(tmp_path)
     first, second = (f"DCIM/{name}" for name in names)
@@ -128,8 +124,7 @@ def test_photos_as_3dgs_convert_expects_them(tmp_path):
 
 def test_fewer_pictures_of_results_lie_beside_the_photos(tmp_path):
     photos(tmp_path / "images", 5)
-    for i in range(3):
-        Image.fromarray(pattern(16, 12, 10 + i)).save(tmp_path / f"mesh{i}.jpg")
+    write_photos(tmp_path, [f"mesh{i}.jpg" for i in range(3)], seed=10)
     dataset = find_photos(tmp_path)
     assert [record.image.parent.name for record in dataset.records] == ["images"] * 5
     others = "are not read, because there are more in"
@@ -249,18 +244,14 @@ def test_cameras_of_a_run_are_found_by_names_in_other_case_or_form_of_an_accent(
 
 def test_folders_far_below_count_if_none_is_near(tmp_path):
     for place in (tmp_path / "kitti/2011_09_26/drive_0001/image_02/data", tmp_path / "kitti/photos"):
-        place.mkdir(parents=True)
-        for i in range(4):
-            Image.fromarray(pattern(16, 12, i)).save(place / f"{i}.jpg")
+        photos(place)
         assert inner_folder(tmp_path) == place
 
 
 def test_a_folder_of_a_set_beside_the_photos_is_named(tmp_path):
     write_blender(tmp_path / "nerfstudio_data", 4)
     for place in (tmp_path / "images", tmp_path / "images_2"):
-        place.mkdir()
-        for i in range(4):
-            Image.fromarray(pattern(16, 12, i)).save(place / f"{i}.jpg")
+        photos(place)
     assert find_photos(tmp_path).notes == ("photos in folders of it are not read: nerfstudio_data",)
 
 

@@ -3,12 +3,11 @@
 import shutil
 
 import pytest
-from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.readers.bare_photos import find_photos
 from sehdr_warp.scene.readers.colmap import model_fits, read_colmap
-from tests.make_scenes import load, pattern, write_colmap
+from tests.make_scenes import load, write_colmap, write_photos
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -118,9 +117,7 @@ def test_photos_beside_undistorted_copies(tmp_path):
     (tmp_path / "sparse" / "0").rename(tmp_path / "dense" / "sparse")
     (tmp_path / "images").rename(tmp_path / "dense" / "images")
     (tmp_path / "sparse").rmdir()
-    (tmp_path / "images").mkdir()
-    for i in range(6):
-        Image.fromarray(pattern(70, 52, i)).save(tmp_path / "images" / f"{i:03d}.png")
+    write_photos(tmp_path / "images", [f"{i:03d}.png" for i in range(6)], (70, 52))
     view = load(tmp_path, holdout=0).views[0]
     assert view.source == tmp_path / "dense" / "images" / "000.png" and view.camera.width == 64
 
@@ -143,9 +140,7 @@ def test_what_3dgs_convert_leaves_before_it_undistorts(tmp_path, copies):
     (tmp_path / "distorted").mkdir()
     (tmp_path / "sparse").rename(tmp_path / "distorted" / "sparse")
     if copies:  # Undistorted, of another size: the model is not theirs.
-        (tmp_path / "images").mkdir()
-        for i in range(6):
-            Image.fromarray(pattern(58, 44, i)).save(tmp_path / "images" / f"{i:03d}.png")
+        write_photos(tmp_path / "images", [f"{i:03d}.png" for i in range(6)], (58, 44))
     scene = load(tmp_path, holdout=0)
     assert scene.format == "colmap" and len(scene.points) == 5
     assert {view.source.parent.name for view in scene.views} == {"input"}

@@ -4,12 +4,11 @@ import shutil
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.readers.colmap import read_colmap
 from sehdr_warp.scene.readers.colmap_model import find_model
-from tests.make_scenes import load, pattern, write_colmap
+from tests.make_scenes import load, pattern, write_colmap, write_photos
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -47,14 +46,12 @@ def test_of_folders_with_the_names_of_a_model_the_one_with_fewest_others_counts(
     """Photos of several captures are all called 1.jpg, 2.jpg ..."""
     write_colmap(tmp_path, name="{:03d}.png")
     (tmp_path / "images").rename(tmp_path / "scene")
-    for i in range(9):
-        for folder in ("another", "yet_another")[: 2 if i else 1]:
-            (tmp_path / folder).mkdir(exist_ok=True)
-            Image.fromarray(pattern(64, 48, 20 + i)).save(tmp_path / folder / f"{i:03d}.png")
+    for first, folder in enumerate(("another", "yet_another")):
+        write_photos(tmp_path / folder, [f"{i:03d}.png" for i in range(first, 9)], (64, 48), 20 + first)
     assert {record.image.parent.name for record in read_colmap(tmp_path).records} == {"scene"}
     for photo in (tmp_path / "scene").iterdir():
         shutil.copy(photo, tmp_path)
-    Image.fromarray(pattern(64, 48, 30)).save(tmp_path / "cover.png")
+    write_photos(tmp_path, ["cover.png"], (64, 48), 30)
     assert {record.image.parent for record in read_colmap(tmp_path).records} == {tmp_path}
 
 

@@ -4,12 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.dataparser import PlacedPhoto
 from sehdr_warp.scene.load import parse_dataset
-from tests.make_scenes import arc_poses, edited_json, pattern
+from tests.make_scenes import arc_poses, edited_json, write_photos
 
 # The same lens of 64 x 48 pixels: fx 50, fy 52, center (30, 25), k1 0.1, k2 0.02, k3 0.003.
 RADIAL = {"type": "radial3", "distortionParams": ["0.1", "0.02", "0.003"]}
@@ -26,9 +25,7 @@ VERSIONS = {
 def write(folder, version="1.2.6", photos="photos", place="cameras.sfm", **lens):
     """Write six photos and their poses; return world-to-camera of each."""
     poses, places = arc_poses(6), [folder / photos / f"IMG_{i}.jpg" for i in range(6)]
-    places[0].parent.mkdir(parents=True, exist_ok=True)
-    for i, file in enumerate(places):
-        Image.fromarray(pattern(64, 48, i)).save(file)
+    write_photos(folder / photos, [file.name for file in places], (64, 48))
     values = {
         "version": version.split("."),
         "views": [{"viewId": str(i), "poseId": str(i), "intrinsicId": "7", "path": f"D:/shots/{file.name}"}

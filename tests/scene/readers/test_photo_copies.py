@@ -9,7 +9,7 @@ from PIL import Image
 
 from sehdr_warp.scene.readers.bare_photos import find_photos
 from sehdr_warp.scene.unused_files import unused_notes
-from tests.make_scenes import load, pattern, write_blender
+from tests.make_scenes import load, pattern, write_blender, write_photos
 
 from .test_bare_photos import photos
 
@@ -35,7 +35,7 @@ def test_photos_that_are_trained_on_are_not_held_out(tmp_path, place, new):
 def test_depth_and_confidence_beside_photos_are_not_photos(tmp_path):
     """The 3D Scanner App writes all data so; a photo may have such a word in its name."""
     photos(tmp_path)
-    Image.fromarray(pattern(16, 12, 9)).save(tmp_path / "depth_of_field.jpg")
+    write_photos(tmp_path, ["depth_of_field.jpg"], seed=9)
     for i in range(9):
         Image.fromarray(pattern(8, 6, i)[..., 0].astype(np.uint16) << 4).save(tmp_path / f"depth_{i}.png")
         Image.fromarray(pattern(8, 6, i)[..., 0]).save(tmp_path / f"frame-{i}.confidence.png")
@@ -64,7 +64,7 @@ def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):
             Image.fromarray(np.rot90(np.asarray(photo))).resize((32, 48)).save(
                 tmp_path / f"img_{i}.JPG", quality=70, exif=turned
             )
-    Image.fromarray(pattern(96, 64, 9)).save(tmp_path / "IMG_4.jpg")
+    write_photos(tmp_path, ["IMG_4.jpg"], (96, 64), 9)
     (tmp_path / "IMG_3.jpg").write_bytes(b"damaged")
     dataset = find_photos(tmp_path)
     names = [record.image.name for record in dataset.records]
@@ -85,8 +85,7 @@ def test_a_photo_of_the_same_name_that_shows_a_little_more_of_one_side_is_no_cop
 
 
 def test_copies_of_the_same_bytes_are_left_out_and_named(tmp_path):
-    for i in range(4):
-        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
+    write_photos(tmp_path, [f"IMG_{i}.jpg" for i in range(4)], (96, 64))
     shutil.copy(tmp_path / "IMG_2.jpg", tmp_path / "IMG_2 (1).jpg")
     dataset = find_photos(tmp_path)
     assert [record.image.name for record in dataset.records] == [f"IMG_{i}.jpg" for i in range(4)]
@@ -96,8 +95,8 @@ def test_copies_of_the_same_bytes_are_left_out_and_named(tmp_path):
 @pytest.mark.parametrize("edited", ["IMG_E{}.jpg", "img_e{}.HEIC", "IMG_{}-edited.jpg"])
 def test_edited_photos_beside_their_originals_are_left_out_and_named(tmp_path, edited):
     """Check edited photos as phones name them: of another tone they are copies, of another picture they are photos."""
+    write_photos(tmp_path, [f"IMG_{i}.jpg" for i in range(4)], (96, 64))
     for i in range(4):
-        Image.fromarray(pattern(96, 64, i)).save(tmp_path / f"IMG_{i}.jpg")
         brighter = np.minimum(pattern(96, 64, i if i < 3 else 9) * 1.2, 255).astype(np.uint8)
         Image.fromarray(brighter).save(tmp_path / edited.format(i), "PNG")
     dataset = find_photos(tmp_path)
@@ -109,11 +108,10 @@ def test_edited_photos_beside_their_originals_are_left_out_and_named(tmp_path, e
 def test_pictures_of_depth_and_normals_beside_photos_of_their_names_are_not_photos(tmp_path):
     """They may be colored."""
     kinds = ("{}_rgb.png", "{}_normal.png", "{}_depth.png")
-    for seed, (kind, i) in enumerate((kind, i) for kind in kinds for i in range(4)):
-        Image.fromarray(pattern(16, 12, seed)).save(tmp_path / kind.format(i))
+    write_photos(tmp_path, [kind.format(i) for kind in kinds for i in range(4)])
     dataset = find_photos(tmp_path)
     assert [record.view for record in dataset.records] == [f"{i}_rgb" for i in range(4)]
     (note,) = dataset.notes
     assert note.startswith("8 pictures called depth, confidence or normals are left out: 0_depth.png, 0_normal.png")
-    Image.fromarray(pattern(16, 12, 20)).save(tmp_path / "normal_lens.png")
+    write_photos(tmp_path, ["normal_lens.png"], seed=20)
     assert find_photos(tmp_path).records[-1].view == "normal_lens"
