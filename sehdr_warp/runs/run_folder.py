@@ -138,18 +138,13 @@ class RunFolder:
             raise UnreadableError(self.checkpoints, error) from None
         return [self.checkpoints / name for name in names]
 
-    def _no_link(self, file: Path) -> Path:
-        """Return a file of the run; raise InputError if it is a link."""
-        refuse_links(file, self.path)
-        return file
-
     def hashes(self) -> dict[str, str]:
         """Return hashes of the files that decide the picture beside the checkpoint, by their names.
 
         The place of the photos in run.json does not count.
         """
         files = (file for file in (self.config_file, self.scene_file, self.info_file) if file.is_file())
-        values = {file.name: read_object(self._no_link(file)) for file in files}
+        values = {file.name: read_object(file) for file in files}
         values.get(self.info_file.name, {}).pop("data", None)
         return {
             name: hashlib.sha256(json.dumps(each, sort_keys=True).encode()).hexdigest() for name, each in values.items()
@@ -158,7 +153,7 @@ class RunFolder:
     def read_config(self) -> Config:
         """Return the config of the training, with the iterations that it was extended to; see also finished_at()."""
         self.read_info()  # It names a run of another version as such.
-        config = config_of_run(read_object(self._no_link(self.config_file)), self.config_file)
+        config = config_of_run(read_object(self.config_file), self.config_file)
         if not self.extension.is_file():
             return config
         iterations = self._extension("iterations", config.schedule.iterations)
@@ -170,14 +165,14 @@ class RunFolder:
 
     def _extension(self, name: str, least: int = 0) -> int:
         """Return a number of extension.json."""
-        value = read_object(self._no_link(self.extension)).get(name)
+        value = read_object(self.extension).get(name)
         if not isinstance(value, int) or value < least:
             raise InputError(self.extension, f"{name} = {value!r:.40} is not usable", REMEDY)
         return value
 
     def read_info(self) -> dict:
         """Return the values of run.json; see RunValues."""
-        info = read_values(self._no_link(self.info_file), RunValues)
+        info = read_values(self.info_file, RunValues)
         try:
             Response.from_dict(info["response"])
         except SehdrError as error:
@@ -186,7 +181,7 @@ class RunFolder:
 
     def read_scene(self) -> dict:
         """Return the values of scene.json, see describe_scene()."""
-        return read_values(self._no_link(self.scene_file), SceneValues)
+        return read_values(self.scene_file, SceneValues)
 
     def read_cameras(self) -> tuple[CameraEntry, ...]:
         """Return the views of the scene, in its order."""
@@ -213,19 +208,19 @@ class RunFolder:
         """Return the decisions of the run's plan, see DecisionValues; none without a plan."""
         if not self.plan_file.exists():
             return []
-        return read_values(self._no_link(self.plan_file), PlanValues, _REMOVE_FILE)["decisions"]
+        return read_values(self.plan_file, PlanValues, _REMOVE_FILE)["decisions"]
 
     def read_summary(self) -> dict:
         """Return times, memory and counts of the training, see SummaryValues; empty if it has not ended."""
         if not self.summary_file.exists():
             return {}
-        return read_values(self._no_link(self.summary_file), SummaryValues, _REMOVE_FILE)
+        return read_values(self.summary_file, SummaryValues, _REMOVE_FILE)
 
     def read_metrics(self) -> list[dict]:
         """Return the evaluations during the training, see MetricsValues; lines that a kill cut are left out."""
         if not self.metrics.is_file() or self.metrics.stat().st_size == 0:
             return []
-        return list(read_metrics_lines(self._no_link(self.metrics)))
+        return list(read_metrics_lines(self.metrics))
 
     def newest_checkpoint(self, parts: tuple[str, ...] = ("",), remedy: str = _TRAIN_AGAIN) -> Checkpoint:
         """Return the newest sound checkpoint.

@@ -109,7 +109,7 @@ class RunWriter(RunFolder):
             self.require()
         else:
             self.require("choose another folder for the run; --overwrite replaces runs alone")
-        info = read_object(self._no_link(self.info_file), _CHOOSE_OTHER)
+        info = read_object(self.info_file, _CHOOSE_OTHER)
         if not {"format", "base_time", "response"} <= info.keys():
             raise InputError(self.info_file, "is not that of a run of sehdr-warp", _CHOOSE_OTHER)
         with self._lock_held():  # Only to see that no other training holds it.

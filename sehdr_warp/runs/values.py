@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypedDict
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from ..errors import InputError
-from ..files import UnreadableError, read_json, read_text
+from ..files import UnreadableError, read_json, read_text, refuse_links
 from ..scene.gravity import LEAST_UNIT, MOST_UNIT
 from ..scene.images.exif import LONGEST, SHORTEST
 from .config_files import field_and_problem
@@ -232,7 +232,8 @@ def require_readable(data: Mapping[str, object]) -> None:
 
 
 def read_object(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
-    """Return the JSON object in a file of a run, unchecked; raise InputError as read_values does."""
+    """Return the JSON object in a file of a run, unchecked; raise InputError as read_values does, and for a link."""
+    refuse_links(path, path.parent)
     try:
         return read_json(path, _LARGE if path.name == "scene.json" else _SMALL)
     except UnreadableError:
@@ -243,6 +244,7 @@ def read_object(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
 
 def read_metrics_lines(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the lines of metrics.jsonl that are whole; a killed process may leave half of one."""
+    refuse_links(path, path.parent)
     for line in read_text(path, _LARGE, errors="replace").splitlines():
         with suppress(ValueError, RecursionError):  # A ValidationError is a ValueError.
             values = json.loads(line)
