@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -29,17 +29,8 @@ _SMALLEST, _LARGEST = 1 / 32, 8  # Size of a photo in parts of its camera's
 _LEAST_SQUARE = 0.01  # Part by which the sides of a pixel may differ and count as equal
 _KINDS = {"encoded": "JPEG and similar photos", "raw": "RAW photos", "float": "float images"}
 _ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
-
-
-class Brightening(NamedTuple):
-    """Constants of brightened_codes()."""
-
-    midtone: float = 0.3  # As of training.matching
-    least_exponent: float = 0.4  # As of training.matching
-    black: float = 3 / 255  # Noise of a black background
-
-
-BRIGHTENING = Brightening()
+BRIGHTENING = 0.3, 0.4, 3 / 255
+"""Of brightened_codes(): midtone and least exponent as of training.matching, and the noise of a black background."""
 
 
 def usable_photos(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], str, list[str]]:

@@ -45,6 +45,19 @@ def received(scene):
     return (scene.render(camera).hdr.numpy() * angle[..., None]).sum((0, 1))
 
 
+def map_light(scene, middle, focal_length, members):
+    """Light that the map of a camera in the middle has, and what it lacks without lights; the brightest of the rest."""
+    directions = torch.tensor(latlong(512), dtype=torch.float32)
+    options = {"focal_length": focal_length, "pixel_angle": 2 * np.pi / 512}
+    whole, rest = (
+        scene.render_directions(middle, directions, without=without, **options).hdr.mean(2).numpy()
+        for without in ((), members)
+    )
+    angles = np.cos(np.arcsin(latlong(512)[..., 1])) * (2 * np.pi / 512) ** 2
+    total, lost = (float((image * angles).sum()) for image in (whole, whole - rest))
+    return total, lost, rest.max()
+
+
 def test_a_panel_is_found_with_its_place_size_direction_and_light():
     scene = field(panel(), RADIANCE, 0.03)
     (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views())
@@ -163,17 +176,10 @@ def test_a_light_that_every_photo_cuts_off_has_what_a_map_without_it_loses(targe
     (light,) = find_lights(scene, torch.ones(scene.gaussians.count), views(target))
     alphas = [float(scene.render(camera).alpha.sum()) for camera, _ in views(target)]
     assert max(alphas) < 0.9 * float(scene.render(views()[0][0]).alpha.sum())
-    directions = torch.tensor(latlong(512), dtype=torch.float32)
-    options = {"focal_length": 240.0, "pixel_angle": 2 * np.pi / 512}
     middle = np.zeros(3)
-    maps = [
-        scene.render_directions(middle, directions, without=without, **options).hdr.mean(2).numpy()
-        for without in ((), [light.members])
-    ]
-    angles = np.cos(np.arcsin(latlong(512)[..., 1])) * (2 * np.pi / 512) ** 2
-    lost = float(((maps[0] - maps[1]) * angles).sum())
+    total, lost, _ = map_light(scene, middle, 240.0, [light.members])
     assert light.radiance.mean() * light.shape.solid_angle(middle) == pytest.approx(lost, rel=0.08)
-    assert light.share == pytest.approx(lost / float((maps[0] * angles).sum()), rel=0.08)
+    assert light.share == pytest.approx(lost / total, rel=0.08)
 
 
 @pytest.mark.parametrize("target", [(0, 0, 4.0), (4.0, 0, 0), (0, 0, -4.0), (0.5, -3.5, 0)])
@@ -304,18 +310,9 @@ def test_lights_are_listed_with_their_energy_however_many_photos_are_dark(lamps,
     shots = [(camera, time) for (camera, _), time in zip(small_views(), times, strict=True)]
     lights = find_lights(scene, photograph(scene, shots), shots)
     assert len(lights) == count
-    # The light that the map of a camera in the middle lacks without them, in pixels as fine as the photos'
     middle = np.mean([camera.position for camera, _ in shots], axis=0)
-    directions = torch.tensor(latlong(512), dtype=torch.float32)
-    options = {"focal_length": 80.0, "pixel_angle": 2 * np.pi / 512}
-    members = [light.members for light in lights]
-    with_lights, rest = (
-        scene.render_directions(middle, directions, without=without, **options).hdr.mean(2).numpy()
-        for without in ((), members)
-    )
-    angles = np.cos(np.arcsin(latlong(512)[..., 1])) * (2 * np.pi / 512) ** 2
-    lost, total = (float((image * angles).sum()) for image in (with_lights - rest, with_lights))
-    assert rest.max() < 1
+    total, lost, brightest = map_light(scene, middle, 80.0, [light.members for light in lights])
+    assert brightest < 1
     energy = sum(light.radiance.mean() * light.shape.solid_angle(middle) for light in lights)
     assert energy == pytest.approx(lost, rel=0.1) and sum(x.share for x in lights) == pytest.approx(
         lost / total, rel=0.1

@@ -79,7 +79,7 @@ def test_a_constant_that_changes_the_result_finds_cameras_anew(key, monkeypatch)
     values = {name: getattr(sfm, name) + 1 for name in CONSTANTS}
     changes = [
         *values.items(),
-        *(("BRIGHTENING", brightening._replace(**{field: 0.1})) for field in brightening._fields),
+        *(("BRIGHTENING", (*brightening[:i], 0.1, *brightening[i + 1 :])) for i in range(len(brightening))),
     ]
     for name, value in changes:
         with monkeypatch.context() as patch:
