@@ -110,7 +110,7 @@ class UnreadableError(InputError):
 
     def __init__(self, path: Path | str, error: OSError):
         """Set the message from the system's error."""
-        super().__init__(path, f"cannot be read ({error.strerror})", "check its rights")
+        super().__init__(path, f"cannot be read ({error.strerror})", "check its permissions")
 
 
 def refuse_links(path: Path, folder: Path) -> None:

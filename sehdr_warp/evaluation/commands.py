@@ -35,7 +35,7 @@ class PictureOptions:
     max_size: int | None = None
     """Longest side of the truth in pixels, if the pictures are smaller than the set's; the truth is reduced."""
     response: str | None = None
-    """The response by which photos are reduced: a name, a file or auto; by default that of the run around the folder,
+    """The response that decodes photos: a name, a file or auto; by default that of the run around the folder,
     else auto."""
 
 
@@ -45,7 +45,7 @@ class ResultOptions:
 
     json: Path | None = None
     """Also write the figures to this file; - prints them on standard output in place of the table."""
-    lpips: Path | None = None  # Folder with LPIPS weights; without, LPIPS is null.
+    lpips: Path | None = None  # Folder with LPIPS weights; without it, LPIPS is null.
     overwrite: bool = False  # Replace the file of --json.
 
 

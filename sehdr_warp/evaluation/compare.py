@@ -192,9 +192,9 @@ def _notes(result: dict, has_truth: bool) -> list[str]:
     notes = [f"PU21: the maximum of each view's truth is shown at {peak:g} cd/m^2."] * has_truth
     if (scale := result["protocol"]["aligned"].get("scale")) is not None:
         where = "the scored views" if result.get("scale_from") == "scored" else "the training photos"
-        notes.append(f"aligned: radiance times {scale:.4g}, fitted on what {where} do not show clipped.")
+        notes.append(f"aligned: radiance times {scale:.4g}, fitted on pixels that {where} do not clip.")
     if result["lights"]["lost"] and result["lights"].get("energies"):
-        notes.append("lights: what clips in every photo is an estimate; photos in which it does not clip measure it.")
+        notes.append("lights: light that clips in every photo is estimated; darker photos would measure it.")
     if result["lpips_backbone"]:
         notes.append(f"LPIPS: {result['lpips_backbone']}.")
     if result["split"] == "train":

@@ -141,7 +141,7 @@ def remove_earlier(out: Path, names: Iterable[str]) -> None:
             remove(path)
             log.info("%s: removed, because an earlier call wrote it and this one does not", path)
         elif os.path.lexists(path):
-            log.warning("%s: stays, though this call did not write it: it is yours, or was changed", path)
+            log.warning("%s: kept, although this call did not write it: it is yours, or was changed", path)
 
 
 @dataclass

@@ -55,8 +55,7 @@ class ViewFileOptions:
     colorspace: str = "rec709"
     """Primaries of the EXR files, always scene-linear: rec709, acescg, aces2065-1, rec2020, display-p3 or dci-p3."""
     reference_white: float | None = None
-    """Value of display white in hdr/, such as 1, as the photos' middle grey tells it; without it the files hold
-    radiance."""
+    """Value of display white in hdr/, such as 1, by the photos' middle grey; without it files hold radiance."""
     pixel: Literal["half", "float"] = "half"  # Pixel type of the EXR files.
     ocio: str | None = None  # OpenColorIO config for the previews: a file, or ocio://default.
     view: str | None = None  # View of that config, or DISPLAY/VIEW.

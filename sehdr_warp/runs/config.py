@@ -114,8 +114,8 @@ class LossConfig(_Table):
     """treat saturated pixels as a lower bound and black pixels as an upper bound of radiance; if exposures are
     compared, bright codes are intervals too in the last part of a training; false: plain values"""
     clipped_smoothness: Weight = 0.001
-    """weight of the squared difference between the log light of a clipped pixel and the mean around it; applies if
-    exposures are compared"""
+    """weight of the squared difference between the log light of a clipped pixel and the mean of its neighbors; applies
+    if exposures are compared"""
     clipped_estimate: Weight = 0.01
     """weight of the squared distance between the log light of clipped pixels and its estimate; applies if exposures are
     compared. The unit is the estimate's deviation for gain maps, 1.5 stops for the learned prior"""
@@ -133,7 +133,7 @@ class LossConfig(_Table):
     them; more leaves surfaces transparent"""
     size_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
     """weight of the mean size of the Gaussians in units of the cameras' radius (3DGS-MCMC), which shrinks those that no
-    photo supports, and which can lie as veils before new views; it is 0 from the last relocation on, and where a photo
+    photo supports, and which can veil new views; it is 0 from the last relocation on, and where a photo
     shows less than a tenth of the scene"""
 
     @property
@@ -151,7 +151,7 @@ class DensificationConfig(_Table):
     refine_start_iter: Annotated[int, Field(ge=0, le=10**12)] = 500
     """iteration after which the number of Gaussians may change"""
     refine_stop_iter: Annotated[int, Field(ge=0, le=10**12)] = 15_000
-    """iteration from which it stays"""
+    """iteration from which that number no longer changes"""
     refine_every: Iteration = 100
     """iterations between changes"""
     cap_max: Annotated[int, Field(ge=1, le=2**31 - 1)] = 3_000_000
@@ -179,7 +179,7 @@ class AdcConfig(_Table):
     """Options of densification.strategy = "adc" (3DGS, section 5.2)."""
 
     grow_grad2d: Positive = 0.0002
-    """mean gradient of the projected position, in normalised screen units, above which a Gaussian is duplicated or
+    """mean gradient of the projected position, in normalized screen units, above which a Gaussian is duplicated or
     split"""
     grow_scale3d: Positive = 0.01
     """split Gaussians larger than this fraction of the scene, duplicate smaller ones"""

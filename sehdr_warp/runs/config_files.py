@@ -162,7 +162,7 @@ def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping
     if flag is None and flags and not path:  # Contradicting fields: name the flag of the first.
         flag = next((flag for path, flag in flags.items() if path in problem), None)
     if path in GONE:
-        raise InputError(source, f"{problem} is of an earlier version and gone", GONE[path])
+        raise InputError(source, f"{problem} is of an earlier version and was removed", GONE[path])
     if path in RENAMED:
         raise InputError(source, f"{problem} has another name since version 0.3", f"write {RENAMED[path]}")
     raise InputError(flag or source, problem, _REMEDY)
@@ -183,7 +183,7 @@ def config_of_run(values: dict, file: Path) -> Config:
 
 @cache  # A command reads the config several times.
 def _warn_of_gone_field(file: Path, path: str, value: str) -> None:
-    text = "%s: %s = %s is of an earlier version and gone; a training that goes on does without it"
+    text = "%s: %s = %s is of an earlier version and was removed; a training that continues ignores it"
     log.warning(text, file, path, value)
 
 

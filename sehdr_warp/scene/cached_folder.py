@@ -53,4 +53,4 @@ def file_digest(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "blake2b").hexdigest()[:32]
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
+        raise InputError(path, f"cannot be read ({error.strerror or error})", "check its permissions") from None

@@ -241,7 +241,7 @@ def _folder(path: Path | str) -> Path:
             problem, remedy = "is an archive", "unpack it, and give the folder with its photos"
         raise InputError(folder, problem, remedy) from None
     except OSError as error:
-        raise InputError(folder, f"cannot be read ({error.strerror or error})", "check its rights") from None
+        raise InputError(folder, f"cannot be read ({error.strerror or error})", "check its permissions") from None
     if empty:
         raise InputError(folder, "folder is empty", "put the photos there")
     return folder

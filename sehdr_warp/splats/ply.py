@@ -187,7 +187,7 @@ def _start(path: Path) -> bytes:
     except FileNotFoundError:
         raise InputError(path, "file not found", "check the name") from None
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error})", "check the file and its rights") from None
+        raise InputError(path, f"cannot be read ({error.strerror or error})", "check its permissions") from None
 
 
 def _facts(comments: list[str], path: Path) -> dict[str, Any]:

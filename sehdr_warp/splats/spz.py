@@ -130,7 +130,7 @@ def _zstandard_streams(path: Path, data: bytes, streams: int, sizes: list[int]) 
     """
     codec = require_extra("imagecodecs", f"{path}: SPZ of version 4 needs imagecodecs", "spz")
     if streams != len(sizes):
-        raise InputError(path, f"has {streams} streams in place of {len(sizes)}", _DAMAGED)
+        raise InputError(path, f"has {streams} streams instead of {len(sizes)}", _DAMAGED)
     blocks = []
     try:
         (start,) = struct.unpack_from("<I", data, _STREAMS_AT)

@@ -36,7 +36,7 @@ def add_glare(radiance: np.ndarray, index: float) -> np.ndarray:
     if index == 0:
         return radiance
     if not np.isfinite(radiance).all():
-        raise InputError("veiling glare", "radiance that is not finite would spread over the picture", "mend the truth")
+        raise InputError("veiling glare", "radiance that is not finite would spread to all pixels", "correct the truth")
     from scipy.fft import dctn, idctn
 
     height, width = radiance.shape[:2]

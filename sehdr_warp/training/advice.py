@@ -127,7 +127,7 @@ class FinishedTraining:
             elif best := best_if_overfitted(points):
                 better = f"{best.psnr - points[-1].psnr:.1f} dB better at iteration {best.iteration}"
                 remedy = f"add photos from other places, or stop there: {self._command(self.scene, best.iteration)}"
-                lines.append(f"held-out photos were {better}: {train_photos} photos hold no more; {remedy}")
+                lines.append(f"held-out photos were {better}: the scene overfits its {train_photos} photos; {remedy}")
             elif not few_placed and train_photos < _FEW_PHOTOS and points[-1].psnr < 25:
                 nearer = "more from places between them, and nearer, would help most"
                 lines.append(f"{train_photos} photos are few: {nearer}: {again}")

@@ -41,7 +41,7 @@ class SceneOptions:
     max_size: int | None = None  # Longest side of the photos, in pixels; larger ones are reduced.
     holdout: int | None = None
     """Hold out every Nth view for testing, 0 none; by default what the set states, or every 8th."""
-    exposure_index: int | None = None  # Which exposure to take where a view has several; by default the middle one.
+    exposure_index: int | None = None  # Which exposure to take if a view has several; by default the middle one.
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class MachineOptions:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a scene from photos of one exposure. A plan leaves out what it does not need; options you set stay."""
+    """Train a scene from photos of one exposure. A plan leaves out what it does not need, and keeps what you set."""
 
     removed_flags: ClassVar[Mapping[str, str]] = {
         **{flag_of(path): advice for path, advice in GONE.items()},

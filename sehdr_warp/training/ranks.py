@@ -101,7 +101,7 @@ class Ranks:
                 problem = f"{self.info} waited {self._timeout:.0f} s ({TIMEOUT}) for rank {absent[0]}"
                 problem += f" and {len(absent) - 1} more" if len(absent) > 1 else ""
                 raise SehdrError(
-                    f"{problem}: node {nodes} of {self.info.nodes} did not come; start it, or use fewer nodes"
+                    f"{problem}: node {nodes} of {self.info.nodes} did not join; start it, or use fewer nodes"
                 )
             time.sleep(_POLL)
 

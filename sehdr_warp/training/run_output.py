@@ -189,7 +189,7 @@ def remove_unseen(trainer: Trainer) -> Evidence:
         return evidence
     trainer.field.gaussians.keep_only(contributes, trainer.optimizer)
     trainer.strategy.load_state_dict({})  # Its statistics are of the rows before.
-    log.info("removed %d of %d Gaussians, which no training photo shows", count - remaining, count)
+    log.info("removed %d of %d Gaussians that no training photo shows", count - remaining, count)
     return evidence.rows(contributes)
 
 

@@ -20,10 +20,10 @@ class View:
 
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """Folders of runs, or files of Gaussians; with several, the page compares them."""
-    port: int = 8080  # Port; the next free one where it is taken.
+    port: int = 8080  # Port; the next free one if it is in use.
     host: str = "127.0.0.1"  # Address to serve: this machine alone, or 0.0.0.0 for all that can reach it.
     origin: tuple[str, ...] = ()
-    """Address of a proxy before the viewer, such as https://splats.example.org, whose pages may ask it."""
+    """Address of a proxy in front of the viewer, such as https://splats.example.org."""
     device: str | None = None  # cpu or cuda:N; by default the first GPU if there is one.
     data: str | None = None  # The photos, if they have moved since the training.
 

@@ -42,7 +42,7 @@ class Watch(threading.Thread):
                 continue
             try:
                 if not state:
-                    raise SehdrError(f"{path}: has vanished")
+                    raise SehdrError(f"{path}: was removed")
                 run = self._load(path)
                 scene.replace(run, run.clipped_share())
             except SehdrError as error:

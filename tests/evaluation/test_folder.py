@@ -53,7 +53,7 @@ def test_missing_and_extra_files_are_said(tmp_path, logged):
     assert [row["name"] for row in result["views"]] == ["r_3"]
     assert any("1 views have no file: r_2" in line for line in logged)
     assert any("files belong to no view: r_9" in line for line in logged)
-    assert "fitted on what the scored views" in eval_table(result)
+    assert "fitted on pixels that the scored views" in eval_table(result)
 
 
 def test_folders_that_cannot_be_scored(tmp_path):

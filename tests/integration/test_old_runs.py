@@ -47,4 +47,4 @@ def test_a_run_trained_by_a_field_that_is_gone_is_read_with_one_warning(tmp_path
     file.write_text(json.dumps(values))
     assert RunFolder(run).read_config() == RunFolder(run).read_config() == config
     (warning,) = caplog.messages
-    assert warning.startswith(f"{file}: {field} = 0.5 is of an earlier version and gone")
+    assert warning.startswith(f"{file}: {field} = 0.5 is of an earlier version and was removed")

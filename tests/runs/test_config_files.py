@@ -121,7 +121,7 @@ def test_a_gone_field_is_named_unless_it_was_off(tmp_path):
     """Runs and files of earlier versions hold all fields."""
     values = Config().model_dump()
     values["mcmc"]["prune_near_angle"], values["loss"]["clipped_lift"] = 0.0, 0.5
-    problem = "config.json: loss.clipped_lift = 0.5 is of an earlier version and gone; it gained nothing"
+    problem = "config.json: loss.clipped_lift = 0.5 is of an earlier version and was removed; it gained nothing"
     with pytest.raises(InputError, match=problem):
         config_from_dict(values, tmp_path / "config.json")
     values["loss"]["clipped_lift"] = 0.0

@@ -72,5 +72,5 @@ def test_files_that_may_not_be_read_say_so(run, monkeypatch):
         return listdir(path)
 
     monkeypatch.setattr(os, "listdir", refuse)
-    with pytest.raises(InputError, match=r"checkpoints: cannot be read \(Permission denied\); check its rights"):
+    with pytest.raises(InputError, match=r"checkpoints: cannot be read \(Permission denied\); check its permissions"):
         folder.newest_checkpoint()

@@ -74,7 +74,7 @@ def test_damaged_files_of_version_4_are_one_line(tmp_path):
     for damaged, problem in {
         data[:20]: "is damaged SPZ",
         data[:-9]: "is damaged SPZ",
-        data[:15] + b"\5" + data[16:]: "has 5 streams in place of 6",
+        data[:15] + b"\5" + data[16:]: "has 5 streams instead of 6",
         data[:8] + count + data[12:]: "states 5400 bytes for stream 0, of 360000000",
         data[:16] + table + data[20:]: "is damaged SPZ",
         data[:-40] + bytes(40): "is damaged SPZ",

@@ -118,5 +118,5 @@ def test_a_node_that_does_not_come_is_named(tmp_path):
     command = [sys.executable, "-m", "sehdr_warp", *TRAIN, "--out", str(tmp_path / "run"), "-q"]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert ended.returncode == 1 and len(ended.stderr.splitlines()) == 1, ended.stderr
-    assert "rank 0 of 4 on node 0" in ended.stderr and "node 0, 1 of 2 did not come" in ended.stderr
+    assert "rank 0 of 4 on node 0" in ended.stderr and "node 0, 1 of 2 did not join" in ended.stderr
     assert not (tmp_path / "run").exists()

@@ -54,7 +54,7 @@ def default_path(run: "RenderableScene", count: int, up: str | Sequence[float] |
     """
     photos = training_cameras(run)
     if way := walk(photos):
-        log.info("the photos walk ahead, so the path goes along %d of %d of them", len(way), len(photos))
+        log.info("the photos walk ahead, so the path follows %d of %d of them", len(way), len(photos))
         return [widescreen_camera(camera, photos) for camera in walk_path(way, count)]
     path = orbit(photos, count, _focus_distance(run, photos), scene_up(run, up))
     return frame_subject(run, [widescreen_camera(camera, photos) for camera in path], photos)
@@ -132,7 +132,7 @@ def _in_front_of_obstacles(
     smooth = gaussian_filter1d(maximum_filter1d(advance, 2 * width + 1, mode="wrap"), width / 2, mode="wrap")
     parts = np.interp(np.linspace(0, len(checked) - 1, len(path)), np.arange(len(checked)), smooth)
     blocked = np.count_nonzero(advance)
-    log.info("orbit: something near blocked %d of %d views; they come in front of it", blocked, len(checked))
+    log.info("orbit: something near blocked %d of %d views; these cameras move in front of it", blocked, len(checked))
     result = []
     for camera, part in zip(path, parts, strict=True):
         place = camera.position + part * (focus - camera.position)

@@ -200,13 +200,13 @@ def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, disp
     elif kind == "ldr":
         decibels = psnr_of(_splat_renderer(gaussians, run, display_time), _photo_renderer(run, display_time), views)
         words = loss_in_words(decibels)
-        text = "kept: %.1f dB of the scene's own pictures in %s (%s); lost: light above white"
+        text = "kept: %.1f dB against the scene's own pictures in %s (%s); lost: light above white"
         log.info(text, decibels, where, words)
     else:
         times = display_time, display_time / 2**_DARKER
         bright, dim = (psnr_of(_splat_renderer(gaussians, run, t), _srgb_renderer(run, t), views) for t in times)
         words = loss_in_words(min(bright, dim))
-        text = "kept: %.1f dB of the scene at 0 EV, %.1f dB at -%d EV, in %s (%s)"
+        text = "kept: %.1f dB against the scene at 0 EV, %.1f dB at -%d EV, in %s (%s)"
         log.info(text, bright, dim, _DARKER, where, words)
 
 
@@ -226,7 +226,7 @@ def _log_file_loss(
     decibels = psnr_of(_splat_renderer(gaussians, run, display_time), reference, views)
     files = path.parent.rglob("*") if path.name == STREAMED_SOG else [path]
     size = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
-    log.info("compressed: %.1f dB beside %s (%s), %.2f MB", decibels, name, loss_in_words(decibels), size)
+    log.info("compressed: %.1f dB compared with %s (%s), %.2f MB", decibels, name, loss_in_words(decibels), size)
 
 
 def _photo_renderer(run: "RenderableScene", time: float) -> Callable:

@@ -38,7 +38,7 @@ def ocio_view(config: str, view: str, gain: float = 1.0) -> Callable[[np.ndarray
     except refused as error:
         raise InputError(config, f"is not an OpenColorIO config ({_line(error):.120})", "give a .ocio file") from None
     if not read.hasRole(_ROLE):
-        raise InputError(config, f"has no role {_ROLE}, by which light enters", "take a config for OpenColorIO 2")
+        raise InputError(config, f"has no role {_ROLE}, which previews need", "take a config for OpenColorIO 2")
     display, _, name = view.rpartition("/")
     display = display or read.getDefaultDisplay()
     for what, value, options in (

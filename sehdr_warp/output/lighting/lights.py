@@ -141,7 +141,7 @@ def write_lights(
         log.warning("%s", problem)
     lights = lights_as_received(run, run.find_lights(), center, received)
     if not lights:
-        text = "%s: nothing that the photos clipped gives light: no lights, all is in the map of the rest"
+        text = "%s: no lights, because no area that photos clip emits light; the map holds all light"
         log.warning(text, run.path)
     rows = [_describe(light_name(index), light, transform, factor) for index, light in enumerate(lights)]
     if suffix == ".usda":
@@ -203,7 +203,7 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
         transform: To the coordinates of places and sizes; None for those of the scene.
     """
     if not lights:
-        return "no lights: nothing that the photos clipped gives light"
+        return "no lights: no area that photos clip emits light"
     transform = transform or WorldTransform.identity()
     unit_name = "radiance" if unit is None else "cd/m^2"
     lines = [f"name        share  shape  {unit_name:>10}  at least  +- stops  place, size"]

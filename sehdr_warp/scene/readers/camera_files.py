@@ -142,7 +142,7 @@ def _dataparser(path: Path) -> np.ndarray | None:
     """Return the matrix [4, 4] from nerfstudio's coordinates to the set's, None without its file beside the path."""
     beside = path.with_name(_DATAPARSER)
     if not beside.is_file():
-        log.warning("%s: no %s beside it; its cameras are taken as they stand", path, _DATAPARSER)
+        log.warning("%s: no %s next to it; its cameras are used unchanged", path, _DATAPARSER)
         return None
     values = read_json(beside)
     try:
@@ -156,7 +156,7 @@ def _dataparser(path: Path) -> np.ndarray | None:
 def _of_colmap(folder: Path) -> list[tuple[str, Camera]]:
     source = find_model(folder)
     if source is None:
-        raise InputError(folder, "holds no COLMAP model", "give cameras.bin or .txt and its kin, or a camera file")
+        raise InputError(folder, "holds no COLMAP model", "give the folder of a COLMAP model, or a camera file")
     model = read_model(source, points=False)
     if model.unusable:
         raise model.unusable[0]

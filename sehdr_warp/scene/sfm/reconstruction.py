@@ -84,7 +84,7 @@ class Reconstruction:
             notes.append(f"{turned}: views from elsewhere will be wrong; take photos from different places")
         if self.error > MOST_ERROR:
             notes.append(
-                f"the cameras' places are uncertain: points miss their photos by {self.error:.1f} pixels in the mean; "
+                f"camera positions are uncertain: the mean reprojection error is {self.error:.1f} pixels; "
                 "sharper photos, less motion in the scene and one lens and zoom help"
             )
         return tuple(notes)
@@ -360,7 +360,7 @@ def run_mapper(
             options.mapper.abs_pose_min_num_inliers = 15
             if before_again is not None:
                 before_again(set() if best is None else {best.images[i].name for i in best.reg_image_ids()})
-            _log.info("placing the %ss again with weaker conditions", name)
+            _log.info("estimating cameras of the %ss again with weaker conditions", name)
         output = work / f"model{int(patient)}"
         output.mkdir()
         stage_name = f"placing {name}s" if views == 1 else f"placing views of {name}s"

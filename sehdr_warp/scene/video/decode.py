@@ -71,7 +71,7 @@ def open_clip(path: Path) -> Clip:
             problem = "its frames hold the pictures of two lenses side by side or in turns of rows"
             raise InputError(path, problem, "crop it to the picture of one lens, such as by FFmpeg")
         if stream.metadata.get("alpha_mode") == "1" or any(part.is_alpha for part in frame.format.components):
-            _log.warning("%s: its transparency is not read, so what it hides counts as seen", path)
+            _log.warning("%s: its transparency is ignored, so transparent pixels count as visible", path)
         width, height = frame.width, frame.height
         aspect = float(stream.sample_aspect_ratio or 1)
         if not 0.25 <= aspect <= 4:
@@ -133,7 +133,7 @@ def decode(clip: Clip, counts: Any = None) -> Iterator[tuple[int, Any]]:
             except errors.FFmpegError as error:
                 if isinstance(error, EOFError) or number < 0:
                     return
-                _log.warning("%s: is damaged or ends early behind frame %d", clip.path, number + 1)
+                _log.warning("%s: is damaged or ends early after frame %d", clip.path, number + 1)
                 return
             for frame in frames:
                 number += 1

@@ -31,7 +31,7 @@ def test_suffix_and_kind_decide(tmp_path, run, logged):
         read = read_gaussians(tmp_path / name)
         assert (read.color_model, read.degree, read.count) == (color_model, 3, 50)
     assert "b.ply: 50 Gaussians, harmonics of degree 3, scene-linear radiance" in logged
-    assert "kept: 120.0 dB of the scene at 0 EV, 120.0 dB at -4 EV, in 3 views (no visible loss)" in logged
+    assert "kept: 120.0 dB against the scene at 0 EV, 120.0 dB at -4 EV, in 3 views (no visible loss)" in logged
     assert sum(line.startswith("kept:") for line in logged) == 3
 
 
@@ -110,7 +110,7 @@ def test_a_scene_that_does_not_fit_into_the_device_is_exported_as_light_alone(tm
     with pytest.raises(SehdrError, match="does not fit into cpu.* or kind hdr in a .ply"):
         export(run, tmp_path / "a.ply")
     export(run, tmp_path / "a.ply", kind="hdr")
-    assert any(line.startswith("kept: 120.0 dB of the scene at 0 EV") for line in logged)
+    assert any(line.startswith("kept: 120.0 dB against the scene at 0 EV") for line in logged)
 
 
 def test_panoramas_are_not_among_the_pinholes_beside_a_file(tmp_path, run, logged):
@@ -145,7 +145,7 @@ def test_what_a_small_file_loses_is_measured_on_the_file(tmp_path, run, logged, 
     export(run, tmp_path / f"a{suffix}", exposure_time=0.25)
     [line] = [line for line in logged if line.startswith("compressed:")]
     size = (tmp_path / f"a{suffix}").stat().st_size
-    assert "beside the scene (" in line and line.endswith(f"{size / 1e6:.2f} MB")
+    assert "compared with the scene (" in line and line.endswith(f"{size / 1e6:.2f} MB")
     assert float(line.split()[1]) > 25
 
 

@@ -225,7 +225,7 @@ def test_a_scene_without_lights_says_so(run, capsys, monkeypatch):
     monkeypatch.setattr("sehdr_warp.output.commands.open_run", lambda *_: run)
     run.find_lights = list
     run_lights(Lights(run=run.path))
-    assert capsys.readouterr().out == "no lights: nothing that the photos clipped gives light\n"
+    assert capsys.readouterr().out == "no lights: no area that photos clip emits light\n"
 
 
 def test_lights_are_listed_where_files_have_them(run, capsys, monkeypatch):
