@@ -82,7 +82,7 @@ def test_a_perfect_render_is_strict_json():
     trained_on = evaluate(run(lambda hdr: hdr * 1.1), scene(VIEWS[:2]))
     assert trained_on["split"] == "train" and len(trained_on["views"]) == 2
     assert "no test views" in eval_table(trained_on)
-    lights, remedy = {"count": 3, "lost": 1, "energies": [0.2, 0.9]}, "photos in which it does not clip"
+    lights, remedy = {"count": 3, "lost": 1, "energies": [0.2, 0.9]}, "darker photos would measure it"
     assert remedy in eval_table(result | {"lights": lights})
     assert remedy not in eval_table(result | {"lights": lights | {"lost": 0}})
 
