@@ -3,8 +3,8 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import cached_property
-from typing import Any, ClassVar, TypeAlias, overload
+from functools import cached_property, wraps
+from typing import Any, ClassVar, Protocol, TypeAlias, cast, overload
 
 import numpy as np
 import torch
@@ -17,6 +17,34 @@ HALF_CODE = 0.5 / 255  # An encoded value nearer to white than this is stored as
 EXTENSION_SLOPE = 0.05
 START_FLOOR = 1e-6
 Numbers: TypeAlias = np.ndarray | float | Sequence[Any]  # Values that can be turned into an array
+
+
+class _OfNumbers(Protocol):
+    """A method of tensors that takes other numbers, too."""
+
+    @overload
+    def __call__(self, numbers: torch.Tensor, /) -> torch.Tensor: ...
+
+    @overload
+    def __call__(self, numbers: Numbers, /) -> np.ndarray: ...
+
+
+def _for_arrays(method: Callable[[Any, torch.Tensor], torch.Tensor]) -> _OfNumbers:
+    """Let a method of tensors, float32 or float64, take what can be turned into an array, and return an array then."""
+
+    @wraps(method)
+    def call(self: "Response", numbers: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
+        if isinstance(numbers, torch.Tensor):
+            if numbers.dtype not in (torch.float32, torch.float64):
+                raise TypeError(f"a response takes float32 or float64 tensors, not {numbers.dtype}")
+            return method(self, numbers)
+        array = np.asarray(numbers)
+        if array.dtype not in (np.float32, np.float64):
+            array = array.astype(np.float32 if array.dtype == np.float16 else np.float64)
+        # A copy: a negative stride or a read-only array is not a tensor.
+        return method(self, torch.from_numpy(np.array(array, order="C"))).numpy()
+
+    return cast(Any, call)
 
 
 class Response(ABC):
@@ -98,61 +126,39 @@ class Response(ABC):
         """The smallest exposure that is stored as the brightest 8-bit code: f(white) = peak - 0.5/255."""
         return float(self._invert(torch.tensor(self.peak - HALF_CODE, dtype=torch.float64)))
 
-    @overload
-    def encode(self, exposure: torch.Tensor) -> torch.Tensor: ...
-
-    @overload
-    def encode(self, exposure: Numbers) -> np.ndarray: ...
-
-    def encode(self, exposure: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
+    @_for_arrays
+    def encode(self, exposure: torch.Tensor) -> torch.Tensor:
         """Return f(x) in [black, peak]; the gradient is 0 below exposure 0 and beyond the clip point."""
-        return self._through(lambda x: _Pointwise.apply(x, self._encode, 0.0), exposure)
+        return _Pointwise.apply(exposure, self._encode, 0.0)
 
-    @overload
-    def encode_extended(self, exposure: torch.Tensor) -> torch.Tensor: ...
-
-    @overload
-    def encode_extended(self, exposure: Numbers) -> np.ndarray: ...
-
-    def encode_extended(self, exposure: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
+    @_for_arrays
+    def encode_extended(self, exposure: torch.Tensor) -> torch.Tensor:
         """Return f(x) up to the clip point, and f(clip) + EXTENSION_SLOPE log(x / clip) beyond it.
 
         The extension leaves a gradient and a surplus over 1 that a hinge can weigh. For a curve that never clips this
         equals encode.
         """
-        return self._through(lambda x: _Pointwise.apply(x, self._encode, EXTENSION_SLOPE), exposure)
+        return _Pointwise.apply(exposure, self._encode, EXTENSION_SLOPE)
 
-    @overload
-    def decode(self, value: torch.Tensor) -> torch.Tensor: ...
-
-    @overload
-    def decode(self, value: Numbers) -> np.ndarray: ...
-
-    def decode(self, value: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
+    @_for_arrays
+    def decode(self, value: torch.Tensor) -> torch.Tensor:
         """Return the exposure of a value, which is limited to [black, peak].
 
         decode(encode(x)) = x for x in [0, clip_exposure].
 
         A curve that only approaches its peak is inverted up to `white`, since the exact inverse of 1 is infinite.
         """
-        return self._through(
-            lambda y: _Pointwise.apply(y, self._decode) if y.requires_grad else self._exposure_of(y), value
-        )
+        return _Pointwise.apply(value, self._decode) if value.requires_grad else self._exposure_of(value)
 
     def rise(self, value: np.ndarray) -> np.ndarray:
         """Return the derivative d ln x / dz at values z in (black, peak) of exposures x, float64."""
         exposure = np.asarray(self.decode(value))
         return 1 / (exposure * np.maximum(np.asarray(self.slope(exposure)), 1e-9))
 
-    @overload
-    def slope(self, exposure: torch.Tensor) -> torch.Tensor: ...
-
-    @overload
-    def slope(self, exposure: Numbers) -> np.ndarray: ...
-
-    def slope(self, exposure: torch.Tensor | Numbers) -> torch.Tensor | np.ndarray:
+    @_for_arrays
+    def slope(self, exposure: torch.Tensor) -> torch.Tensor:
         """Return df/dx of encode, shaped like the exposures and 0 beyond the clip point; it is not differentiable."""
-        return self._through(lambda x: self._encode(x.detach(), 0.0)[1], exposure)
+        return self._encode(exposure.detach(), 0.0)[1]
 
     @property
     def _limit(self) -> float:
@@ -166,20 +172,6 @@ class Response(ABC):
         exposure = self._exposure_of(value)
         _, slope = self._encode(exposure, 0.0)
         return exposure, torch.where((value < self.black) | (value > self._limit), 0.0, 1.0 / slope)
-
-    @staticmethod
-    def _through(
-        function: Callable[[torch.Tensor], torch.Tensor], argument: torch.Tensor | Numbers
-    ) -> torch.Tensor | np.ndarray:
-        if isinstance(argument, torch.Tensor):
-            if argument.dtype not in (torch.float32, torch.float64):
-                raise TypeError(f"a response takes float32 or float64 tensors, not {argument.dtype}")
-            return function(argument)
-        array = np.asarray(argument)
-        if array.dtype not in (np.float32, np.float64):
-            array = array.astype(np.float32 if array.dtype == np.float16 else np.float64)
-        # A copy: a negative stride or a read-only array is not a tensor.
-        return function(torch.from_numpy(np.array(array, order="C"))).numpy()
 
     def __repr__(self) -> str:
         """Return the class and name."""
