@@ -6,22 +6,20 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..errors import SehdrError, refuse_paths
+from ..runs.run import Run
 from ..scene import Scene, View
 from . import metrics
 from .lights import LightRegion, count_lights, light_regions
 from .perceptual import BACKBONE, SMALLEST_EDGE, load_lpips
 from .protocols import PROTOCOLS, fit_scale, normalize, tone_map, tone_mapped_psnr
 from .ranking import DARKEST_CODE, ErrorRanking
-
-if TYPE_CHECKING:
-    from ..runs.run import Run
 
 PEAK_LUMINANCE = 1000.0
 """cd/m^2 at which PU21 shows the brightest value of a view's truth: the peak of a common HDR display."""
@@ -41,7 +39,7 @@ class Predictions:
     black: float = 0.0  # Largest exposure that photos show as black; matters if there is a confidence
 
 
-def _run_predictions(run: "Run") -> Predictions:
+def _run_predictions(run: Run) -> Predictions:
     """Return the predictions of a trained run."""
     return Predictions(
         hdr=lambda view: run.render(view.camera).hdr,
@@ -53,7 +51,7 @@ def _run_predictions(run: "Run") -> Predictions:
 
 
 @torch.no_grad()
-def evaluate(run: "Run", scene: Scene, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
+def evaluate(run: Run, scene: Scene, *, lpips_weights: Path | str | None = None) -> dict[str, Any]:
     """Render the scene's test views with a trained run and compare them with the photos and the HDR truth.
 
     Args:

@@ -9,7 +9,7 @@ import logging
 import zlib
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ..errors import refuse_paths
 from ..files import atomic_path, check_absent
 from ..kernels.constants import EPS2D, FRUSTUM_MARGIN, NEAR_PLANE
 from ..model.baking import field_of, gaussians_of
-from ..runs.run import Splats
+from ..runs.run import RenderableScene, Splats
 from ..scene import Camera
 from ..splats.arrays import HARMONIC_0
 from .cameras.opening import camera_facts, opening_facts
@@ -28,16 +28,13 @@ from .images.display import display_gain
 from .light_pictures import curve_table
 from .world_transform import WorldTransform, world_transform
 
-if TYPE_CHECKING:
-    from ..runs.run import RenderableScene
-
 log = logging.getLogger(__name__)
 _HALF = float(np.finfo(np.float16).max)
 _ANY_FOCALS = 0.0, 1e9  # Pixels; if those of the photos are not known, every picture is filtered like a photo
 
 
 def write_scene_page(
-    run: "RenderableScene", path: Path | str, *, edits: SplatEdits | None = None, overwrite: bool = False
+    run: RenderableScene, path: Path | str, *, edits: SplatEdits | None = None, overwrite: bool = False
 ) -> Path:
     """Write a run as one HTML file that any browser with WebGL2 shows; return the path.
 

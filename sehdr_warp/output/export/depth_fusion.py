@@ -3,20 +3,18 @@
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from ...errors import SehdrError, require_extra
 from ...progress import track_progress
+from ...runs.run import RenderableScene
 from ...scene import Camera
 from ...scene.wide_camera import face_cameras, face_size
 from ..world_transform import WorldTransform
 from .splat_edits import Box, Sphere
-
-if TYPE_CHECKING:
-    from ...runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 MOST_VIEWS, _VIEW_SIZE = 40, 400  # Training views that are fused, and their longest side in pixels
@@ -37,7 +35,7 @@ class DepthView:
 
 
 def depth_views(
-    run: "RenderableScene", camera: Camera, transform: WorldTransform, size: int = _VIEW_SIZE
+    run: RenderableScene, camera: Camera, transform: WorldTransform, size: int = _VIEW_SIZE
 ) -> list[DepthView]:
     """Render a camera's depth, at most `size` pixels long: one view of a pinhole, the faces of a wide camera.
 
@@ -53,7 +51,7 @@ def depth_views(
     ]
 
 
-def _depth_view(run: "RenderableScene", camera: Camera, transform: WorldTransform) -> DepthView:
+def _depth_view(run: RenderableScene, camera: Camera, transform: WorldTransform) -> DepthView:
     rendered = run.render(camera)
     depth = np.where(rendered.alpha.cpu().numpy() > _LEAST_ALPHA, rendered.depth.cpu().numpy(), 0) * transform.scale
     flat = np.ones(depth.shape, bool)

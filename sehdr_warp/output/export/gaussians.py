@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from ...errors import InputError, SehdrError, refuse_paths
 from ...files import atomic_path
 from ...model.baking import field_of, fit_to_pictures, gaussians_of, psnr_of, with_photo_filters
 from ...response import response_by_name
-from ...runs.run import on_device
+from ...runs.run import RenderableScene, on_device
 from ...scene.exposure.times import shutter
 from ...splats import (
     STREAMED_SOG,
@@ -34,9 +33,6 @@ from ..images.display import display_gain
 from ..world_transform import WorldTransform, file_transform, is_y_down, photos_to_file, world_transform
 from .splat_edits import SplatEdits, most_visible, without_strays
 
-if TYPE_CHECKING:
-    from ...runs.run import RenderableScene
-
 log = logging.getLogger(__name__)
 KINDS = ("ldr", "hdr")
 _MAX_COMPARED = 8  # Views in which a file is compared with the scene
@@ -45,7 +41,7 @@ _WORDS = ((42.0, "no visible loss"), (36.0, "close copy"), (30.0, "small differe
 
 
 def export(
-    run: "RenderableScene",
+    run: RenderableScene,
     path: Path | str,
     *,
     kind: str | None = None,
@@ -130,14 +126,14 @@ def export(
     return path
 
 
-def _turned(run: "RenderableScene", path: Path) -> WorldTransform:
+def _turned(run: RenderableScene, path: Path) -> WorldTransform:
     """Return the half turn that a file with +Y up and one with -Y up differ by; the identity between files alike."""
     turn = np.diag([-1.0, -1.0, 1.0]) if is_y_down(run.path) != is_y_down(path) else np.eye(3)
     return WorldTransform(turn, np.zeros(3))
 
 
 def _select_rows(
-    run: "RenderableScene", gaussians: GaussianArrays, mask: np.ndarray, edits: SplatEdits, display_time: float
+    run: RenderableScene, gaussians: GaussianArrays, mask: np.ndarray, edits: SplatEdits, display_time: float
 ) -> GaussianArrays:
     """Return the Gaussians of a mask without strays; the most visible, fitted to pictures, if they are too many."""
     part, most = gaussians.rows(mask), edits.max_gaussians
@@ -151,7 +147,7 @@ def _select_rows(
     return without_strays(part, training_cameras(run))
 
 
-def _gaussians_in_colors(run: "RenderableScene", color_model: str, display_time: float) -> GaussianArrays:
+def _gaussians_in_colors(run: RenderableScene, color_model: str, display_time: float) -> GaussianArrays:
     """Return the Gaussians of a run in the scene's coordinates and in the colors of a file.
 
     Display colors are those of a photo of `display_time` seconds.
@@ -191,7 +187,7 @@ def loss_in_words(decibels: float) -> str:
     return "visible loss"
 
 
-def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, display_time: float, note: str) -> None:
+def _log_loss(run: RenderableScene, gaussians: GaussianArrays, kind: str, display_time: float, note: str) -> None:
     """Measure and log how well Gaussians in the scene's coordinates show it; `note` follows the number of views."""
     views = every_nth(split_or_all(run, "test"), _MAX_COMPARED)
     where = f"{len(views)} view{'s' * (len(views) != 1)}{note}"
@@ -211,7 +207,7 @@ def _log_loss(run: "RenderableScene", gaussians: GaussianArrays, kind: str, disp
 
 
 def _log_file_loss(
-    path: Path, run: "RenderableScene", part: GaussianArrays | None, to_file: WorldTransform, display_time: float
+    path: Path, run: RenderableScene, part: GaussianArrays | None, to_file: WorldTransform, display_time: float
 ) -> None:
     """Measure and log what a compressed file loses, read back, beside the part that was exported or the scene."""
     views = every_nth(split_or_all(run, "test"), _MAX_COMPARED)
@@ -229,24 +225,24 @@ def _log_file_loss(
     log.info("compressed: %.1f dB compared with %s (%s), %.2f MB", decibels, name, loss_in_words(decibels), size)
 
 
-def _photo_renderer(run: "RenderableScene", time: float) -> Callable:
+def _photo_renderer(run: RenderableScene, time: float) -> Callable:
     """Return a function that renders simulated photos; in Rec.709 and sRGB if the photos have a sensor's colors."""
     return _srgb_renderer(run, time) if run.color_matrix is not None else lambda camera: run.render_ldr(camera, time)
 
 
-def _srgb_renderer(run: "RenderableScene", time: float) -> Callable:
+def _srgb_renderer(run: RenderableScene, time: float) -> Callable:
     """Return a function that renders radiance at an exposure time, encoded by sRGB."""
     encode = response_by_name("srgb").encode
     return lambda camera: encode(run.render(camera).hdr * time)
 
 
-def _splat_renderer(gaussians: GaussianArrays, run: "RenderableScene", time: float) -> Callable:
+def _splat_renderer(gaussians: GaussianArrays, run: RenderableScene, time: float) -> Callable:
     """Return a function that renders Gaussians in the scene's coordinates as sRGB, on the run's device."""
     field = on_device(field_of(gaussians), run.device)
     return lambda camera: field.render_ldr(camera, time)
 
 
-def _write_cameras(path: Path, run: "RenderableScene", transform: WorldTransform, overwrite: bool) -> None:
+def _write_cameras(path: Path, run: RenderableScene, transform: WorldTransform, overwrite: bool) -> None:
     described, wide = [], [entry.name for entry in run.cameras if not entry.camera.is_pinhole]
     if wide:
         log.info("%s: without %s, because it holds pinholes alone", path.name, first_names(wide, 5))

@@ -9,7 +9,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ import torch
 from ...errors import InputError, SehdrError, refuse_paths
 from ...files import atomic_path, check_absent
 from ...progress import track_progress
+from ...runs.run import RenderableScene
 from ...scene import Camera
 from ...splats.usd import pxr, writing_usd
 from ...subsets import evenly
@@ -35,9 +35,6 @@ from .depth_fusion import (
     zero_surface,
 )
 from .splat_edits import Box, Sphere, read_region
-
-if TYPE_CHECKING:
-    from ...runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 SUFFIXES = (".obj", ".usda", ".usdc")
@@ -85,7 +82,7 @@ class ProxyMesh:
 
 
 def write_proxy_mesh(
-    run: "RenderableScene",
+    run: RenderableScene,
     path: Path | str,
     *,
     resolution: int = 160,
@@ -159,7 +156,7 @@ def check_mesh(path: Path | str, resolution: int, crop: str | None, overwrite: b
 
 
 def proxy_mesh(
-    run: "RenderableScene",
+    run: RenderableScene,
     transform: WorldTransform,
     *,
     up: str | Sequence[float] | None = None,
@@ -193,7 +190,7 @@ def proxy_mesh(
 
 
 def _without_lights(
-    run: "RenderableScene", transform: WorldTransform, vertices: np.ndarray, faces: np.ndarray, voxel: float
+    run: RenderableScene, transform: WorldTransform, vertices: np.ndarray, faces: np.ndarray, voxel: float
 ) -> np.ndarray:
     """Return the triangles that are not at Gaussians of the scene's lights, whose light they would block."""
     from scipy.spatial import KDTree
@@ -276,7 +273,7 @@ def mesh_depth(mesh: ProxyMesh, camera: Camera) -> np.ndarray:
     return np.where(np.isfinite(depth), depth, 0).reshape(camera.height, camera.width)
 
 
-def _log_agreement(mesh: ProxyMesh, run: "RenderableScene", transform: WorldTransform) -> None:
+def _log_agreement(mesh: ProxyMesh, run: RenderableScene, transform: WorldTransform) -> None:
     """Compare the depth of mesh and scene in a few held-out views, and log it."""
     cameras = evenly(split_or_all(run, "test"), _CHECKED)
     low, high = mesh.vertices.min(0) - mesh.voxel, mesh.vertices.max(0) + mesh.voxel
@@ -309,7 +306,7 @@ def _ground_line(ground: Ground, transform: WorldTransform, up_of_photos: np.nda
     return f"{line}; --up={up} levels it, here and for render, export and envmap"
 
 
-def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: "RenderableScene") -> None:
+def _write_obj(path: Path, mesh: ProxyMesh, transform: WorldTransform, run: RenderableScene) -> None:
     """Write an OBJ file with vertex colors, in sRGB with the exposure of the photos."""
     colors = encode_srgb(np.clip(mesh.radiance * run.base_time, 0, 1))
     with path.open("w", encoding="utf-8") as file:

@@ -3,19 +3,16 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...errors import SehdrError
 from ...model.visibility import contributions, count_views, mask_shares
+from ...runs.run import RenderableScene
 from ...scene import Camera, View
 from ...scene.wide_camera import painted_mask
 from ...splats import GaussianArrays
 from ..cameras.scene_cameras import camera_positions, common_focus, training_cameras
-
-if TYPE_CHECKING:
-    from ...runs.run import RenderableScene
 
 log = logging.getLogger(__name__)
 LEAST_OPACITY = 1 / 255  # Opacity below which 3DGS rasterizers, this one included, draw nothing
@@ -114,7 +111,7 @@ class SplatEdits:
         """True if the file shows less than the scene: a part, or the scene without floaters or haze."""
         return bool(self.shows_part or self.min_views or self.min_opacity > LEAST_OPACITY)
 
-    def mask(self, opacities: np.ndarray, means: np.ndarray, run: "RenderableScene") -> np.ndarray:
+    def mask(self, opacities: np.ndarray, means: np.ndarray, run: RenderableScene) -> np.ndarray:
         """Return [N], which Gaussians stay.
 
         Args:
@@ -167,7 +164,7 @@ def _empty_file_error(means: np.ndarray) -> SehdrError:
     return SehdrError(f"these edits leave no Gaussian; the scene lies at {extent} in the coordinates of these regions")
 
 
-def most_visible(mask: np.ndarray, count: int, run: "RenderableScene") -> np.ndarray:
+def most_visible(mask: np.ndarray, count: int, run: RenderableScene) -> np.ndarray:
     """Return [N], which of the Gaussians that stay are the `count` that contribute most to the training views.
 
     Raises:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ import torch
 from ...errors import SehdrError, refuse_paths
 from ...files import atomic_path, check_absent
 from ...model.lights import Light, ReceivedLight, light_name, received_light
+from ...runs.run import RenderableScene, Run
 from ...scene.wide_camera import typical_focal_length
 from ...subsets import first_names
 from ..cameras.scene_cameras import training_cameras
@@ -24,9 +25,6 @@ from ..world_transform import WorldTransform, world_transform
 from .environment_map import COVERED, inpainted_light, latlong, little_visible, map_part, render_map, solid_angles
 from .map_center import MapCenter, find_center
 from .unit import luminance_of_one
-
-if TYPE_CHECKING:
-    from ...runs.run import RenderableScene, Run
 
 log = logging.getLogger(__name__)
 SUFFIXES = (".json", ".usda")
@@ -74,7 +72,7 @@ _DOME = """    def DomeLight "Rest"
 
 
 def write_lights(
-    run: "Run",
+    run: Run,
     path: Path | str,
     *,
     axes: str = "upright",
@@ -162,13 +160,13 @@ def write_lights(
     return files
 
 
-def _received_at(run: "RenderableScene", center: MapCenter) -> ReceivedLight:
+def _received_at(run: RenderableScene, center: MapCenter) -> ReceivedLight:
     focal = typical_focal_length(training_cameras(run))
     return received_light(run.field, center.position, focal, beyond=center.beyond, degree=run.degree)
 
 
 def lights_as_received(
-    run: "RenderableScene", lights: Sequence[Light], center: MapCenter, received: ReceivedLight | None = None
+    run: RenderableScene, lights: Sequence[Light], center: MapCenter, received: ReceivedLight | None = None
 ) -> list[Light]:
     """Return lights with the radiance that gives, with their shapes, the light that a place receives of each.
 
@@ -285,7 +283,7 @@ def _tuple(values) -> str:
 
 
 def _write_rest(
-    run: "Run",
+    run: Run,
     path: Path,
     lights: Sequence[Any],
     transform: WorldTransform,
@@ -318,7 +316,7 @@ def _write_rest(
 
 
 def _shows_lights(
-    run: "Run", members: Sequence[torch.Tensor], center: MapCenter, to_scene: np.ndarray, focal: float
+    run: Run, members: Sequence[torch.Tensor], center: MapCenter, to_scene: np.ndarray, focal: float
 ) -> np.ndarray:
     """Return [H, W] whether half of the light of a map's pixel and more comes from Gaussians of lights.
 

@@ -2,17 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from ...runs.run import RenderableScene
 from ...scene import View
 from ..cameras.paths import interpolate
 from ..images.display import display_gain
 from ..light_pictures import photo_for_display, photo_light
-
-if TYPE_CHECKING:
-    from ...runs.run import RenderableScene
 
 _GREY, _DARKEST = 0.3, -12  # Display light at which what photos clip is shown; stops that this may take
 _CLIPPED, _BRIGHTER = 0.99, 4 / 3  # Encoded value that counts as clipped; factor that counts as brighter
@@ -77,7 +75,7 @@ def first_picture(comparison: Comparison) -> FirstPicture:
     return FirstPicture(stops, "Light above white", lead)
 
 
-def compare(run: "RenderableScene", view: View, views: Sequence[View], scale: float = 1.0) -> Comparison:
+def compare(run: RenderableScene, view: View, views: Sequence[View], scale: float = 1.0) -> Comparison:
     """Render a view of a run and compare it with its photo.
 
     Args:

@@ -3,12 +3,13 @@
 import base64
 import io
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
+from ...runs.run import RenderableScene
 from ...scene import Camera
 from ...subsets import evenly
 from ..cameras.framing import visible_surface
@@ -16,9 +17,6 @@ from ..cameras.scene_cameras import camera_positions, split_or_all
 from ..html import EMPTY, join, markup
 from ..images.ldr_files import quantize
 from .charts import PANELS, training_points
-
-if TYPE_CHECKING:
-    from ...runs.run import RenderableScene
 
 LINE, COLORS = "var(--line)", ("var(--accent)", "var(--cool)")  # Of style.css
 _MAP_VIEWS, _MAP_SIZE, _SAMPLES = 12, 640, 200
@@ -59,7 +57,7 @@ def training_svg(metrics: Sequence[Mapping]) -> Markup:
     return _svg(484, 280, "Held-out PSNR against training time", elements)
 
 
-def camera_map(run: "RenderableScene", tone_map: Any, names: Sequence[str] = ()) -> Markup:
+def camera_map(run: RenderableScene, tone_map: Any, names: Sequence[str] = ()) -> Markup:
     """Draw the scene from above as its training photos show it, with training and held-out cameras, some with `names`.
 
     Returns SVG, empty if there are no cameras; `tone_map` converts radiance [N, 3] to sRGB.
@@ -111,7 +109,7 @@ def camera_map(run: "RenderableScene", tone_map: Any, names: Sequence[str] = ())
     return _svg(round(width), round(height), "Cameras from above", elements)
 
 
-def _visible_points(cameras: Sequence[Camera], run: "RenderableScene", up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _visible_points(cameras: Sequence[Camera], run: RenderableScene, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points of the scene [N, 3] and their radiance, from small renders of some cameras.
 
     What lies higher than the cameras, such as a ceiling, is left out.

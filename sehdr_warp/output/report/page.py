@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -11,6 +11,7 @@ from markupsafe import Markup
 from ... import __version__
 from ...model.lights import Light, light_name
 from ...progress import format_duration
+from ...runs.run import Run
 from ...scene import Scene
 from ...scene.camera import limited_size
 from ...scene.exposure.times import shutter
@@ -27,9 +28,6 @@ from ..world_transform import WorldTransform, world_transform
 from .comparison import Comparison, first_picture
 from .diagrams import camera_map, training_svg
 
-if TYPE_CHECKING:
-    from ...runs.run import Run
-
 STOPS = (-4, -2, 0, 2, 4)
 _PICTURE, _DIAL, _STRIP = 880, 420, 220  # Longest sides of pictures, pixels
 _MOST_PHOTOS = 6  # With unexplained regions
@@ -38,7 +36,7 @@ SPACE = "\N{NARROW NO-BREAK SPACE}"
 
 
 def report_page(
-    run: "Run",
+    run: Run,
     scene: Scene,
     comparisons: Sequence[Comparison],
     brightest: Comparison,
@@ -92,7 +90,7 @@ def _views(figures: Sequence[Markup]) -> Markup:
     return markup('<div class="views">{}</div>', join(figures))
 
 
-def _header(run: "Run", scene: Scene, picture: Markup) -> Markup:
+def _header(run: Run, scene: Scene, picture: Markup) -> Markup:
     """Return title, first picture and figures of the training."""
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
     camera = max((view.camera for view in scene.views), key=attrgetter("pixel_count"))
@@ -127,7 +125,7 @@ def _header(run: "Run", scene: Scene, picture: Markup) -> Markup:
     )
 
 
-def _pictures(run: "Run", comparisons: Sequence[Comparison], held_out: bool) -> Markup:
+def _pictures(run: Run, comparisons: Sequence[Comparison], held_out: bool) -> Markup:
     """Photo, scene and truth, two at a time with a slider between them."""
     figures = []
     for each in comparisons:
@@ -236,7 +234,7 @@ def _confidence(comparisons: Sequence[Comparison]) -> Markup:
     return _section("Confidence", lead, _views(figures) + scale)
 
 
-def _unexplained_regions(run: "Run", scene: Scene) -> Markup:
+def _unexplained_regions(run: Run, scene: Scene) -> Markup:
     """Show the photos with the worst unexplained regions, each region in a box."""
     unexplained = run.summary().get("unexplained")
     if unexplained is None:
@@ -324,7 +322,7 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> Markup:
     return _section("Figures", markup("{}.{}", split, note), body)
 
 
-def _map(run: "Run", comparisons: Sequence[Comparison]) -> Markup:
+def _map(run: Run, comparisons: Sequence[Comparison]) -> Markup:
     gain = float(np.median([each.scale for each in comparisons]))
     tone_map = fit_tone_map([each.hdr for each in comparisons], [each.alpha for each in comparisons], gain)
     lead = markup(
@@ -335,7 +333,7 @@ def _map(run: "Run", comparisons: Sequence[Comparison]) -> Markup:
     return _section("Cameras", lead, _figure(svg))
 
 
-def _footer(run: "Run", held_out: bool) -> Markup:
+def _footer(run: Run, held_out: bool) -> Markup:
     return markup(
         "<footer>\n<p>sehdr-warp {}. Brackets as OpenEXR: <code>sehdr-warp render {} --out views{} --evs=-4,-2,0,2,4"
         "</code></p>\n<p>{}, and clipped light is not in the photos.</p>\n</footer>",

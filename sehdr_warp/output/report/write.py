@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ...errors import InputError, SehdrError, refuse_paths
 from ...files import atomic_path, check_absent
 from ...own_files import first_unlisted
 from ...progress import track_progress
+from ...runs.run import Run
 from ...scene import Scene, View
 from ...scene.exposure.times import shutter
 from ...scene.images.ldr_files import LDR_SUFFIXES, RAW_SUFFIXES
@@ -23,9 +24,6 @@ from ..images.tonemap import fit_tone_map
 from .charts import PANELS, QUIET, STYLE, save_picture, training_chart, training_points
 from .comparison import Comparison, compare, darker_stops
 from .page import STOPS, report_page, stops_text
-
-if TYPE_CHECKING:
-    from ...runs.run import Run
 
 log = logging.getLogger(__name__)
 _PHOTOS = 3  # Pictures of others in a folder that tell that it is one of photos
@@ -43,7 +41,7 @@ def check_report_folder(out: Path) -> None:
 
 
 def write_report(
-    run: "Run",
+    run: Run,
     scene: Scene,
     out: Path | str,
     *,
