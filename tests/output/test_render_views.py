@@ -127,7 +127,7 @@ def test_an_earlier_render_leaves_nothing_beside_a_new_one(tmp_path, logged):
     assert all(path.exists() for path in user_files) and (tmp_path / "camera_path.json").is_symlink()
     assert not (tmp_path / "brackets_ldr").exists() and not (tmp_path / "brackets.json").exists()
     for name in ("brackets", "cameras.chan", "camera_path.json"):
-        assert any(line.startswith(f"{tmp_path / name}: stays, though") for line in logged)
+        assert any(line.startswith(f"{tmp_path / name}: kept, although") for line in logged)
 
 
 @pytest.mark.parametrize("multipart", [False, True])
