@@ -1,13 +1,16 @@
 """Load sets: splits, names, responses, the embedded scene and folders of photos."""
 
+import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.scene.load import holdout_indices
-from tests.make_scenes import load, write_blender, write_colmap, write_ply
+from sehdr_warp.synth.expose import write_radiance
+from tests.make_scenes import load, write_blender, write_colmap, write_photos, write_ply
 
 
 def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
@@ -52,3 +55,19 @@ def test_splits(tmp_path):
     write_colmap(tmp_path / "few", 4)
     few = load(tmp_path / "few")
     assert not few.test_views and "no views are held out for testing" in few.notes
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights")
+@pytest.mark.parametrize("name", ["images/000.png", "masks/000.png", "hdr/000.exr"])
+def test_a_photo_mask_or_truth_that_leads_out_of_the_set_is_refused(tmp_path, name):
+    write_colmap(tmp_path / "set")
+    file, secret = tmp_path / "set" / name, tmp_path / name.replace("/", "_")
+    if file.suffix == ".exr":
+        write_radiance(secret, np.ones((48, 64, 3), np.float32))
+    else:
+        write_photos(tmp_path, [secret.name], (64, 48))
+    file.parent.mkdir(exist_ok=True)
+    file.unlink(missing_ok=True)
+    file.symlink_to(secret)
+    with pytest.raises(InputError, match="leads outside the data folder by a link; copy what it links to"):
+        load(tmp_path / "set")

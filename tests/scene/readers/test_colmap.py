@@ -153,15 +153,6 @@ def test_undistorted_copies_of_3dgs_convert_are_used_if_they_are_whole(tmp_path)
     assert {view.source.parent.name for view in load(tmp_path, holdout=0).views} == {"images"}
 
 
-def test_link_out_of_the_folder_is_refused(tmp_path):
-    write_colmap(tmp_path / "set")
-    secret = tmp_path / "secret.png"
-    (tmp_path / "set" / "images" / "000.png").rename(secret)
-    (tmp_path / "set" / "images" / "000.png").symlink_to(secret)
-    with pytest.raises(InputError, match="by a link; copy what it links to"):
-        load(tmp_path / "set")
-
-
 def test_the_folder_of_photos_may_be_a_link(tmp_path):
     """Photos may lie on another disk; what the model names stays inside that folder."""
     write_colmap(tmp_path / "set")
