@@ -30,7 +30,7 @@ def test_nerfstudio_paths_of_other_projections_are_refused(tmp_path, kind):
 
 def test_nerfstudio_paths_come_back_from_the_dataparsers_space(tmp_path, logged):
     np.testing.assert_allclose(nerfstudio(tmp_path, POSE).world_to_camera, POSE, atol=1e-9)
-    assert "no dataparser_transforms.json beside it" in logged[0]
+    assert "no dataparser_transforms.json next to it" in logged[0]
     # As nerfstudio moves poses: rotated and shifted, then places scaled.
     turn, scale = look_at((0.3, -1.0, 0.2), (1.0, 0.0, 0.0)), 0.25
     moved = turn @ np.linalg.inv(POSE)
