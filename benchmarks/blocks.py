@@ -261,7 +261,7 @@ def _train_blocks(
             begin, end = spans[block.name]
             summary = json.loads((out / FOLDER / block.name / "summary.json").read_text())
             values = {"photos": len(block.views), "steps": plan.config.schedule.iterations, "seconds": end - begin}
-            beside = "beside another" if at_once > 1 else "alone"
+            beside = "while another trains" if at_once > 1 else "alone"
             study.add(f"{block.name}, {beside}", **values, **_facts(summary))
     return spans
 

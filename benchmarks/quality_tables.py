@@ -22,7 +22,7 @@ def quality_tables(result: dict) -> Iterable[str]:
     yield "## In short: the middle exposure, one seed, the curve known"
     yield markdown_table(in_short(rows), SHORT)
     if len(by_curve := curves_in_short(rows)) > 1:
-        yield f"## `{by_curve[0]['method']}` by the photos' curve: the middle exposure, one seed, the curve known"
+        yield f"## `{by_curve[0]['method']}` for several curves: the middle exposure, one seed, the curve known"
         yield markdown_table(by_curve, BY_CURVE)
     for (curve,), mine in groups([row for row in rows if row["response"] in (KNOWN, LEARNED)], "curve").items():
         suffix = "" if curve == rows[0]["curve"] else f", curve {curve}"
@@ -154,7 +154,7 @@ def _irradiance_tables(rows: Sequence[Mapping]) -> Iterable[str]:
     rows = [row for row in rows if row.get("irradiance") is not None]
     if not rows:
         return
-    yield "## Irradiance: off by, and what the photos clip"
+    yield "## Irradiance error, and share of clipped pixels"
     medians = []
     for (method,), mine in groups(rows, "method").items():
         whole = [row["irradiance"] for row in mine if row["clipped_share"] < NOTHING_CLIPS]
