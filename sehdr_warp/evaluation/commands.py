@@ -62,7 +62,7 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Compare:
-    """Compare trained runs in one table; runs that differ by their seed alone become a mean with its deviation."""
+    """Compare trained runs in one table, with mean and deviation of runs that differ by their seed alone."""
 
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """Folders of runs, or a folder that holds runs; of these, those without an evaluation yet are left out."""

@@ -103,7 +103,7 @@ def find_lights(
     *,
     degree: int | None = None,
 ) -> list[Light]:
-    """Return the lights of a scene, those that give most first.
+    """Return the lights of a scene, sorted by their share of light.
 
     Args:
         field: a trained scene.

@@ -197,7 +197,7 @@ def changed_flags(options: Any) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write report.html: figures, photo, scene and truth side by side, brackets, where it fails; and pictures."""
+    """Write report.html: figures; photo, scene and truth side by side; brackets; failures; and pictures."""
 
     run: Positional[Path]  # Folder of a run.
     out: Path  # Folder for the page and the pictures.
@@ -312,7 +312,7 @@ def run_lights(args: Lights) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Meter:
-    """Set the unit of a scene's light by one reading of a meter or a grey card, and keep it with the run.
+    """Set the unit of a scene's light by one reading of a meter or a grey card, and store it with the run.
 
     Pictures and environment maps then state cd/m^2, and lights are written in cd/m^2.
     """

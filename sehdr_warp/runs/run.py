@@ -152,7 +152,7 @@ class RenderableScene:
         return None
 
     def find_lights(self) -> list[Light]:
-        """Return the lights of the scene that the photos clipped, those that give most first.
+        """Return the lights of the scene that the photos clipped, sorted by their share of light.
 
         Radiance is in linear Rec.709.
 

@@ -96,9 +96,7 @@ class FinishedTraining:
         if self.misfit:
             return [f"the cameras that the set states do not fit its photos; find them anew {self._anew}"]
         if (share := summary.get("estimated_light") or 0.0) > _MUCH_LIGHT:
-            remedy = (
-                "photos in which lamps do not clip measure it; this says which lights lack them, and how many stops"
-            )
+            remedy = "darker photos would measure it; for which lights, and by how many stops"
             estimated = f"{share:.0%} of the light is an estimate, because photos clip it"
             lines.append(f"{estimated}; {remedy}: sehdr-warp lights {run}")
         few_placed = 2 * self.unplaced >= train_photos

@@ -66,7 +66,7 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
-    """Turn a file of Gaussians into one of another kind."""
+    """Convert a file of Gaussians to another format."""
 
     source: Positional[Path]  # The file: .ply, .glb, .usda, .usdc, .usdz, .sog, .spz or .compressed.ply.
     out: Positional[Path]  # The file to write; its suffix decides.

@@ -203,7 +203,7 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
     measure = "radiance" if unit is None else "cd/m\N{SUPERSCRIPT TWO}"
     titles = ("name", "shape", "size", "place", "share of light", measure, "certain at least", "deviation, stops")
     lead = (
-        "Lamps, windows and other areas that photos clip, those that give most first. Their radiance is an estimate "
+        "Lamps, windows and other areas that photos clip, by their share of light. Their radiance is an estimate "
         "with a deviation; what photos show as white is certain. Places are upright, as in exported files. Share: of "
         "the light at the middle of the cameras."
     )
@@ -317,7 +317,7 @@ def _table(evaluation: Mapping[str, Any] | None, held_out: bool) -> Markup:
     ]
     titles = ["part of the photos", "pixels", "photo PSNR, dB", *["HDR mu-law PSNR, dB"] * has_hdr]
     body += markup("\n<br>\n") + _rows(titles, regions, first_number=1)
-    split = "Held-out views" if held_out else "Training views, since none is held out: figures flatter"
+    split = "Held-out views" if held_out else "Training views, since none is held out: figures are too high"
     note = markup(" HDR under the protocol gt-max; <code>sehdr-warp eval</code> has the others.") if has_hdr else EMPTY
     return _section("Figures", markup("{}.{}", split, note), body)
 
