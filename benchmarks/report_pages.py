@@ -50,7 +50,7 @@ def write_reports(folder: Path) -> list[Path]:
         index.append({"report": f"[{page['title']}]({name}.md)", "machine": place, "build": build})
     if (folder / "tried.csv").is_file():
         pages.append(_write(folder / "tried.md", _tried_page(folder / "tried.csv")))
-        index.append({"report": "[Negative results](tried.md)"})
+        index.append({"report": f"[{PAGES['tried']['title']}](tried.md)"})
     text = (
         "Measurements, each with its commands, machine and build. `python -m benchmarks.measure PAGE` measures a page "
         "again. `python -m benchmarks.report_pages` writes the pages and the README's table from the results."
@@ -84,28 +84,9 @@ def _tried_page(path: Path) -> list[str]:
     with open(path, newline="", encoding="utf-8") as file:
         topics = groups(csv.DictReader(file), "topic")
     columns: dict[str, str] = dict.fromkeys(("option", "idea", "gave", "on"), "")
-    text = (
-        "Ideas that were built and measured, and that mostly did not become the default: they were removed, or are "
-        "options that are off. *Adopted* marks those that did.\n\n"
-        "- *option*: the config field or the change; a field that `sehdr-warp config` does not list was removed again. "
-        "*idea*: why it might help. *gave*: the result. *on*: scenes and protocol.\n"
-        "- Unless a row says otherwise, dB are differences of held-out mu-law PSNR (`gt-max`) to the same training "
-        "without the change. Differences below 0.2 dB are within seed variance. 21.3 (21.0) is 21.3 with the change "
-        "and 21.0 without. Several values stand in the order of the options.\n"
-        "- *photos*: PSNR of simulated photos. *irradiance*: error of the light that surfaces would receive, in the "
-        "mean over scenes. *lights lost*: lights that most held-out views render with less than half of their "
-        "radiance ([quality](quality.md)). *planned*: by the rules of [the plan](../plan.md). *cap density*: "
-        "`mcmc.cap_density`, the largest number of Gaussians over the square root of the pixels of all photos.\n"
-        "- *Rooms* are the eight rendered scenes of [synthetic scenes](../synth.md), with exposures 0 (darkest) to 4, "
-        "of which 2 is the middle one; *tuned scenes* are those on which settings were chosen; *demo*: the training of "
-        "`make demo`. *by* hdr-nerf, sRGB or `camera`: photos simulated with that [response](../response.md). "
-        "*Captures* are the real photos of [their page](captures.md).\n"
-        "- *The prior* is the network that estimates [clipped light](../light-prior.md); its *RMS* is over clipped "
-        "values, in stops. *page*, *wall*, *snow*, *lamp of 60*: small test scenes with a surface of that many times "
-        "white ([light](../light.md))."
-    )
     tables = [part for (topic,), rows in topics.items() for part in (f"## {topic}", markdown_table(rows, columns))]
-    return ["# Negative results", text, *tables]
+    page = PAGES["tried"]
+    return [f"# {page['title']}", page["text"], *tables]
 
 
 def main() -> None:

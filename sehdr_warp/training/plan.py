@@ -37,8 +37,8 @@ last third."""
 CPU_CAP_DENSITY = 60.0  # mcmc.cap_density if time is short: more steps gain more than more Gaussians
 GPU_CAP_DENSITY = 480.0
 """mcmc.cap_density on a GPU if there are more than MANY_PHOTOS photos of a scene that is not large. Held-out photos are
-then sharper; with fewer, Gaussians fit what single photos show, which costs 0.15 dB. Blocks keep the requested value:
-see BlockPlan.config_of()."""
+then sharper; with fewer, Gaussians fit what single photos show: 240 costs 0.24 dB there. Blocks keep the requested
+value: see BlockPlan.config_of()."""
 MANY_PHOTOS = 20
 RATES_FOR = 30_000  # Length of the trainings that 3DGS's learning rates are for
 RATE_POWER, MAX_RATE_SCALE = 0.22, 2.5  # Rates of shorter trainings grow with this power, up to this factor
