@@ -214,8 +214,8 @@ def _changed_light(compensation: ExposureCompensation, views: Sequence[View]) ->
         return ""
     names = first_names([f"{views[i].name} {off[i]:+.1f}" for i in changed])
     return (
-        f"; {counted(len(changed), 'photo is', 'photos are')} brighter or darker than stated (stops: {names}), as "
-        "where clouds pass or a camera brightens by itself"
+        f"; {counted(len(changed), 'photo is', 'photos are')} brighter or darker than stated (stops: {names}); "
+        "clouds may have passed, or the camera brightens photos by itself"
     )
 
 
@@ -230,8 +230,8 @@ def _decision(
         figures.append(f"{compensation.white_balance:.2f} stops of white balance between photos")
     if components.vignetting:
         figures.append(f"{compensation.corner_loss:.0%} towards the corners")
-    over = ", over the times they state" if components.exposure else ", exposures stay as stated"
-    choice = f"taken out of the photos{over if times_known else ''}"
+    kept = ", in addition to stated exposure times" if components.exposure else "; stated exposure times are kept"
+    choice = f"corrected in the photos{kept if times_known else ''}"
     changed = _changed_light(compensation, matched.views) if times_known else ""
     reason = f"matched points differ by {', '.join(figures)}{changed}{_reach_note(matched)}"
     return Decision({}, choice, reason, COMPENSATION, always_log=True)

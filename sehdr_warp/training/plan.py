@@ -112,12 +112,12 @@ class Plan:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             lines.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
         if code := self.facts.plateau:
-            problem = f"no photo is brighter than code {code} of 255, which many pixels have: they clip there"
-            lines.append(f"plan: {problem}, and that is taken for their light; export them with white at 255")
+            problem = f"no photo is brighter than code {code} of 255, and many pixels have that code: they clip"
+            lines.append(f"plan: {problem}, but count as not clipped; export the photos with white at 255")
         is_measured = self.facts.unclipped or (self.config.loss.uses_hdr and self.facts.truths)
         if self.facts.clipped_when_dark >= CLIPPED and not is_measured:
             estimated = f"{self.facts.clipped:.1%} of the pixels clip, and their light above white is an estimate"
-            remedy = "three photos in which lamps and windows do not clip measure it"
+            remedy = "three photos in which lamps and windows do not clip would measure it"
             if (dark := self.facts.clipped_when_dark) < self.facts.clipped:
                 remedy = f"the darkest photos clip, too ({dark:.1%} of their pixels): {remedy}"
             lines.append(f"plan: {estimated}; {remedy}")
@@ -219,14 +219,14 @@ def _light(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
         )
         return Decision(zero_weights, "from the photos", f"{facts.clipped:.1%} of the pixels are clipped")
     fields: dict[str, object] = {"loss.ldr_weight": 0.0, "loss.hdr_weight": 1.0, "loss.form": "blend"}
-    reason = f"{facts.truths} float pictures have any brightness: on a photo's curve, errors of highlights count little"
-    return Decision(fields, "in the mu-law", reason)
+    reason = f"{facts.truths} float images have no white level; encoded, errors of highlights would count little"
+    return Decision(fields, "float images, by the mu-law", reason)
 
 
 def _brackets(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     darker, brighter = (2 if facts.clipped < 0.001 else 4), (2 if facts.black < 0.001 else 4)
     reason = (
-        f"{facts.clipped:.1%} of the pixels clip, {facts.black:.1%} are black: look at -{darker} to +{brighter} EV "
+        f"{facts.clipped:.1%} of the pixels clip, {facts.black:.1%} are black: export -{darker} to +{brighter} EV "
         f"(render --evs=-{darker},0,{brighter}); brackets are computed at export, from one render"
     )
     if not config.fusion.enabled:
@@ -268,7 +268,7 @@ def _densification(facts: SceneFacts, config: Config, device: torch.device) -> D
         start = max(facts.points, start_count(config, facts.pixels))
         choice = f"mcmc, growing to at most {most} Gaussians" if start < most else "mcmc without growth"
         return Decision(fields, choice, f"{reason}; {start} to start with")
-    # Relocation has this budget by itself; densification by gradients stops nowhere.
+    # mcmc has this cap itself; adc has none of its own.
     most = min(options.cap_max, max(most, 2 * facts.points))
     reason += f"; {facts.points} points to start from"
     return Decision({"densification.cap_max": most}, f"{most} Gaussians", reason)
@@ -322,7 +322,7 @@ def _rates(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     if slow:
         rates["harmonics_rest"] = FEW_PHOTOS_HARMONICS
         choices.append(f"{FEW_PHOTOS_HARMONICS:g} for view-dependent color")
-        reasons.append(f"{facts.photos} photos determine few of {harmonics} harmonics")
+        reasons.append(f"{facts.photos} photos are too few for {harmonics} harmonics of each Gaussian")
     if not rates:
         return Decision({}, "as they are", f"{steps} steps")
     return Decision({f"optimizer.{name}": rate for name, rate in rates.items()}, ", ".join(choices), "; ".join(reasons))

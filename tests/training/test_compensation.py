@@ -52,10 +52,10 @@ def test_drift_is_found_where_there_is_some(device):
 def test_stated_times_are_doubted_where_photos_contradict_them(device):
     scene, _ = drifting()
     drift, decision = found_in(replace(scene, exposure_times_known=True), CONFIG, LINEAR, device)
-    assert drift.stops > 0.4 and "over the times they state" in decision.choice and decision.always_log
+    assert drift.stops > 0.4 and "in addition to stated exposure times" in decision.choice and decision.always_log
     assert re.search(r"; 3 photos are brighter or darker than stated \(stops: v_[147] -1\.0, v_", decision.reason)
     right = wall_and_lamp(TIMES)
-    # A curve that is not the photos' makes right times look wrong, and evened photos would not agree.
+    # A curve that is not the photos' makes right times look wrong, and compensated photos would not agree.
     for curve in (LINEAR, response_by_name("gamma")):
         drift, decision = found_in(right, CONFIG, curve, device)
         assert drift is None and "do not contradict" in decision.reason
@@ -86,12 +86,20 @@ def test_stated_times_stay_where_colors_or_corners_alone_drift(device):
         tinted.append(replace(view, codes=codes_of(view.image * 2**white_balance, 8)))
         darkened.append(replace(view, codes=codes_of(view.image * corners, 8)))
     drift, decision = found_in(replace(scene, views=tuple(tinted)), CONFIG, LINEAR, device)
-    assert "stay as stated" in decision.choice and "white balance" in decision.reason and drift.corner_loss == 0
+    assert (
+        "stated exposure times are kept" in decision.choice
+        and "white balance" in decision.reason
+        and drift.corner_loss == 0
+    )
     fitted = np.log2([drift.gains[view.name] for view in views])
     np.testing.assert_allclose(fitted, light, atol=0.06)
     assert (fitted[:, 1] == 0).all()
     drift, decision = found_in(replace(scene, views=tuple(darkened)), CONFIG, LINEAR, device)
-    assert "stay as stated" in decision.choice and drift.corner_loss == pytest.approx(0.5, abs=0.1) and not drift.stops
+    assert (
+        "stated exposure times are kept" in decision.choice
+        and drift.corner_loss == pytest.approx(0.5, abs=0.1)
+        and not drift.stops
+    )
 
 
 def test_vignetting_that_points_do_not_reach_is_left_out_and_named(device):
@@ -117,7 +125,7 @@ def test_times_that_a_camera_rounds_are_put_right(device):
     scene = wall_and_lamp(TIMES)
     views = [replace(v, exposure_time=v.exposure_time * 2**-e) for v, e in zip(scene.views, off, strict=True)]
     drift, decision = found_in(replace(scene, views=tuple(views)), CONFIG, LINEAR, device)
-    assert "over the times they state" in decision.choice
+    assert "in addition to stated exposure times" in decision.choice
     assert not re.search("white balance|than stated", decision.reason), decision.reason
     fitted = np.log2([drift.gains[view.name] for view in views])
     np.testing.assert_allclose(fitted, (off - off.mean())[:, None].repeat(3, 1), atol=0.03)
@@ -156,7 +164,7 @@ def test_a_clear_sky_is_no_drift(device):
     assert estimate_compensation(scene, CONFIG, LINEAR, device).compensation is None
 
 
-def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
+def test_a_run_keeps_the_gains_and_resumes_on_compensated_photos(tmp_path):
     scene, times = drifting()
     scene = replace(scene, color_matrix=2 * np.eye(3))
     training = create_trainer(scene, tmp_path / "run", SHORT, device="cpu")
@@ -165,21 +173,23 @@ def test_a_run_keeps_the_gains_and_resumes_on_evened_photos(tmp_path):
             training.stop()
     run = load_run(tmp_path / "run")
     decision = next(entry for entry in run.decisions() if entry["name"] == "exposure-compensation")
-    assert "out of the photos" in decision["choice"] and "stops" in decision["reason"]
-    evened = run.normalize_photos(scene)
+    assert "corrected in the photos" in decision["choice"] and "stops" in decision["reason"]
+    compensated = run.normalize_photos(scene)
     assert (run.color_matrix == scene.color_matrix).all()
-    ratios = [view.exposure_time / time for view, time in zip(evened.views, times, strict=True)]
+    ratios = [view.exposure_time / time for view, time in zip(compensated.views, times, strict=True)]
     assert np.ptp(ratios) / np.mean(ratios) < 0.05
     resumed = create_trainer(scene, tmp_path / "run", resume=True, device="cpu")
     for views in (training.scene.views, resumed.scene.views):
-        assert [view.exposure_time for view in views] == pytest.approx([view.exposure_time for view in evened.views])
+        assert [view.exposure_time for view in views] == pytest.approx(
+            [view.exposure_time for view in compensated.views]
+        )
     for value, known, is_named in (("never", False, False), ("unstated", True, False), ("unstated", False, True)):
         config = load_config("default", {"model.exposure_compensation": value})
         assert estimates_compensation(replace(scene, exposure_times_known=known), config, LINEAR) == is_named
 
 
-def test_large_photos_are_matched_and_evened_small(monkeypatch):
-    """Full-size copies of a large set, evened again and again, would take more memory than there is."""
+def test_large_photos_are_matched_and_compensated_small(monkeypatch):
+    """Full-size copies of a large set, compensated again and again, would take more memory than there is."""
     (scene, _), sizes, even, most = drifting(), [], ExposureCompensation.normalize_photos, 96
     monkeypatch.setattr("sehdr_warp.training.matching.LARGEST_SIDE", most)
     large = tuple(

@@ -111,7 +111,7 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
     drifting = with_images(scene, lambda view: np.full_like(view.image, 0.02) + view.image * next(shares))
     for known, line_count in ((False, 1), (True, 0)):
         plan = make_plan(replace(drifting, exposure_times_known=known), config_of())
-        for choice, count in ((UNMEASURED, line_count), ("taken out of the photos", 0), ("none", 0)):
+        for choice, count in ((UNMEASURED, line_count), ("corrected in the photos", 0), ("none", 0)):
             gains = Decision({}, choice, "", "exposure-compensation")
             case = replace(plan, decisions=(*plan.decisions, gains))
             lines = [line for line in case.lines() if "no exposure times" in line and "exposures.json" in line]

@@ -160,11 +160,11 @@ def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
     assert lenses(zoomed) == [0] * PHOTOS and lenses([one] * 4 + [two, None]) == [0, 0, 0, 0, -1, -1]
 
 
-def test_evened_photos_hold_the_light_without_gains(gains):
+def test_compensated_photos_hold_the_light_without_gains(gains):
     plain, scene = photographed({}, {}), photographed(gains, everywhere(VIGNETTING))
-    evened = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
-    assert ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(evened, SRGB) is evened
-    for ours, truth in zip(evened.views, plain.views, strict=True):
+    compensated = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
+    assert ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(compensated, SRGB) is compensated
+    for ours, truth in zip(compensated.views, plain.views, strict=True):
         measurable = (truth.image > 0.1) & (ours.image < 0.95)
         light = SRGB.decode(ours.image) / ours.exposure_time
         np.testing.assert_allclose(light[measurable], SRGB.decode(truth.image)[measurable], rtol=0.04)
@@ -187,23 +187,23 @@ def test_white_stays_white_and_black_black(gains):
 
 
 @pytest.mark.parametrize("vignetting", [None, VIGNETTING])
-def test_photos_are_evened_row_by_row_as_by_their_light(gains, vignetting):
+def test_photos_are_compensated_row_by_row_as_by_their_light(gains, vignetting):
     tall = np.random.default_rng(5).integers(0, 256, (3 * BAND_ROWS + 5, 20, 3), dtype=np.uint8)
     camera = Camera(20, len(tall), 60.0, 60.0, 10.0, len(tall) / 2, np.eye(4))
     view = View("p_0", tall, camera, 2.0, "train")
     fitted = ExposureCompensation(gains, {} if vignetting is None else {"p_0": vignetting})
-    (evened,) = fitted.normalize_photos(
+    (compensated,) = fitted.normalize_photos(
         Scene("tall", "hand-made", (view,), np.zeros((0, 3)), np.zeros((0, 3))), SRGB
     ).views
     largest = max(gains["p_0"])
     light = SRGB.decode(view.image.astype(np.float64)) / (fitted.light(view) / largest)
     expected = codes_of(SRGB.encode(light), 16)
     expected[tall == 255] = 65535
-    assert evened.exposure_time == 2.0 * largest
-    assert np.abs(evened.codes.astype(int) - expected).max() <= 1
+    assert compensated.exposure_time == 2.0 * largest
+    assert np.abs(compensated.codes.astype(int) - expected).max() <= 1
 
 
-def test_photos_that_do_not_fit_into_memory_are_evened_into_a_file(gains, monkeypatch, caplog):
+def test_photos_that_do_not_fit_into_memory_are_compensated_into_a_file(gains, monkeypatch, caplog):
     scene = photographed(gains, everywhere(VIGNETTING))
     in_memory = ExposureCompensation(gains, everywhere(VIGNETTING)).normalize_photos(scene, SRGB)
     monkeypatch.setattr(photo_storage, "available_memory", lambda: 0)
