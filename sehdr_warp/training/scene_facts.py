@@ -21,8 +21,10 @@ MOST_PIXELS = 250_000  # Largest number of pixels that are read from a photo
 LARGE_SCENE = 0.1  # A scene is large if its photos contain less than this part of its points, in the mean
 MOST_VIEWS = 64  # Largest number of photos whose codes are read; cameras are read of all
 LOWEST_PLATEAU = 200  # Lowest code, of 255, that photos clip at below white, as after an edit
-PLATEAU_CODES = 3  # Brightest codes that occur, over which JPEG spreads the clipped pixels
+PLATEAU_CODES = 3  # Over which JPEG spreads most of the clipped pixels
 PLATEAU_SHARE, PLATEAU_EXCESS = 1e-3, 3.0  # Least part of the pixels that they hold, and multiple of the codes below
+RINGING = 8  # Codes above white that JPEG hardly reaches at the edges of clipped areas
+MOST_RINGING = 0.1  # Of the clipped pixels that are brighter still
 
 
 class PointFacts(NamedTuple):
@@ -135,12 +137,15 @@ def _sampled(view: View) -> np.ndarray:
 
 
 def _plateau(views: Sequence[View]) -> int:
-    """Return the code of 255, below 255, that is the largest of many pixels of the photos; 0 if there is none."""
-    counts = np.zeros(256)
+    """Return the code of 255, below 255, that many pixels of the photos have and hardly any exceeds; 0 without one."""
+    counts = np.zeros(256 + RINGING)
     for view in views:
         brightest = _sampled(view).max(1)
-        counts += np.bincount(np.rint(255 * brightest).astype(np.int64), minlength=256)
-    largest = int(counts.nonzero()[0].max(initial=0))
-    at, below = (counts[max(0, top - PLATEAU_CODES) : top].sum() for top in (largest + 1, largest + 1 - PLATEAU_CODES))
-    is_plateau = at >= PLATEAU_SHARE * counts.sum() and at >= PLATEAU_EXCESS * below
-    return largest if is_plateau and LOWEST_PLATEAU <= largest < 255 else 0
+        counts += np.bincount(np.rint(255 * brightest).astype(np.int64), minlength=len(counts))
+    code = LOWEST_PLATEAU + int(counts[LOWEST_PLATEAU:256].argmax())
+    middle = code - PLATEAU_CODES // 2
+    below, at, above = (
+        counts[middle + offset :][:PLATEAU_CODES].sum() for offset in (-PLATEAU_CODES, 0, PLATEAU_CODES)
+    )
+    is_peak = at >= PLATEAU_SHARE * counts.sum() and at >= PLATEAU_EXCESS * below and at >= above
+    return code if is_peak and code < 255 and counts[code + RINGING :].sum() <= MOST_RINGING * at else 0

@@ -1,9 +1,11 @@
 """Figures of a scene that are measured before its training."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sehdr_warp.scene import codes_of
 from sehdr_warp.training.scene_facts import measure_scene
@@ -44,3 +46,31 @@ def test_facts_count_what_masks_keep(scene):
     assert before.clipped == before.clipped_when_dark == 12 / 32
     assert facts.clipped == facts.clipped_when_dark == facts.plateau == 0
     assert 0 < facts.contrast < before.contrast
+
+
+@pytest.mark.parametrize(
+    ("white", "quality", "plateau"), [(240, 95, 240), (228, 85, 228), (240, None, 240), (255, 95, 0), (190, 95, 0)]
+)
+def test_a_white_below_255_is_found_in_jpegs_that_ring(scene, white, quality, plateau):
+    """Noisy rooms with a window, whose edge JPEG makes brighter than the window in some pixels."""
+    rng, views = np.random.default_rng(0), []
+    for view in scene.views:
+        light = np.clip(rng.normal(0.5, 0.08, (96, 128, 1)), 0, 1) * [1.0, 0.9, 0.8]
+        light[20:70, 30:90] = 1
+        codes = np.rint(white * light).astype(np.uint8)
+        if quality:
+            file = io.BytesIO()
+            Image.fromarray(codes).save(file, "JPEG", quality=quality)
+            codes = np.asarray(Image.open(file))
+            assert white == 255 or codes.max() > white + 2
+        views.append(replace(view, codes=codes))
+    assert measure_scene(replace(scene, views=tuple(views))).plateau == plateau
+
+
+@pytest.mark.parametrize("lamp", [False, True], ids=["shaded wall", "even page beside a lamp"])
+def test_a_bright_surface_is_no_white_below_255(scene, lamp):
+    codes = np.random.default_rng(0).normal(225, 6, (96, 128, 1)).clip(0, 254).repeat(3, 2)
+    if lamp:
+        codes[10:50, 10:60], codes[60:70, 60:70] = 225, 255
+    views = [replace(view, codes=np.rint(codes).astype(np.uint8)) for view in scene.views]
+    assert measure_scene(replace(scene, views=tuple(views))).plateau == 0
