@@ -31,6 +31,10 @@ class LightShape:
             return replace(self, size=(width, factor * self.size[0] * height / width))
         return replace(self, size=(width * factor**0.5, height * factor**0.5))
 
+    def surrounds(self, point: np.ndarray) -> bool:
+        """Return whether a point lies within a sphere."""
+        return self.kind == "sphere" and float(np.linalg.norm(point - self.position)) < self.size[0] / 2
+
     def solid_angle(self, point: np.ndarray) -> float:
         """Return the solid angle that a point sees of a light; 0 from behind a rectangle, 2 pi within a sphere."""
         towards = self.axes @ (point - self.position)

@@ -119,9 +119,9 @@ def write_environment_map(
         directions = map_directions(size, layout) @ transform.rotation
         added = (1 - rendered.alpha[..., None]) * inpainted_light(rendered.hdr, rendered.alpha, directions, weight)
     shares = light_shares(rendered.hdr, added, rendered.clipped, rendered.certain, weight)
-    coverage = 100 * weight[rendered.alpha > COVERED].sum() / weight.sum()
+    coverage = covered_percent(rendered.alpha, weight)
     rest = "" if inpaint or coverage > _WHOLE else "; the rest is black, --inpaint fills it with the light around it"
-    log.info("%s: %.0f %% of all directions seen%s", path.name, coverage, rest)
+    log.info("%s: photos cover %.0f %% of all directions%s", path.name, coverage, rest)
     log.info("its light is\n%s", shares.table())
     light = rendered.hdr + added
     if path.suffix.lower() == ".hdr":
@@ -306,6 +306,11 @@ def solid_angles(size: int, layout: str) -> np.ndarray:
     place = 2 * (np.arange(size) + 0.5) / size - 1
     face = (1 + place[:, None] ** 2 + place**2) ** -1.5
     return np.tile(face, (6, 1))
+
+
+def covered_percent(alpha: np.ndarray, weight: np.ndarray) -> float:
+    """Return how much of all directions photos cover, each as far as its alpha [H, W], in per cent."""
+    return 100 * float((alpha * weight).sum() / weight.sum())
 
 
 def inpainted_light(hdr: np.ndarray, alpha: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -22,7 +22,16 @@ from ..images.display import exposure_for_white
 from ..images.exr import write_multipart_exr
 from ..picture_header import provenance
 from ..world_transform import WorldTransform, world_transform
-from .environment_map import COVERED, inpainted_light, latlong, little_visible, map_part, render_map, solid_angles
+from .environment_map import (
+    COVERED,
+    covered_percent,
+    inpainted_light,
+    latlong,
+    little_visible,
+    map_part,
+    render_map,
+    solid_angles,
+)
 from .map_center import MapCenter, find_center
 from .unit import luminance_of_one
 
@@ -89,7 +98,8 @@ def write_lights(
     A light is a group of Gaussians that the photos clipped. With its size, its radiance gives the light that reaches
     the place `at` of it, so a lamp whose shade hides it from there is dimmer than in the table. A USD file has a
     SphereLight or RectLight for each, and a DomeLight for everything else: a map as write_environment_map() takes it at
-    the same place, `<stem>_rest.exr`, in which the lights are dark. Its alpha is the coverage by photos. If the unit of
+    the same place, `<stem>_rest.exr`, in which the lights are dark. A sphere around the place stays in this map: within
+    it gives no light. Alpha is the coverage by photos. If the unit of
     the run's light is known, lights and dome are in cd/m^2, as USD has them.
 
     Args:
@@ -141,9 +151,15 @@ def write_lights(
     if not lights:
         text = "%s: no lights, because no area that photos clip emits light; the map holds all light"
         log.warning(text, run.path)
-    rows = [_describe(light_name(index), light, transform, factor) for index, light in enumerate(lights)]
+    named = {light_name(index): light for index, light in enumerate(lights)}
+    if inside := [name for name, light in named.items() if light.shape.surrounds(center.position)]:
+        remains = "its light stays in the map of the rest" if suffix == ".usda" else "a sphere lights nothing within"
+        log.warning("%s: the place that is lit lies within the sphere: %s", first_names(inside, 5), remains)
     if suffix == ".usda":
-        inpainted = _write_rest(run, rest, lights, transform, axes, center, unseen, overwrite)
+        named = {name: light for name, light in named.items() if name not in inside}
+    rows = [_describe(name, light, transform, factor) for name, light in named.items()]
+    if suffix == ".usda":
+        inpainted = _write_rest(run, rest, list(named.values()), transform, axes, center, unseen, overwrite)
         mark = "@@@" if "@" in rest.name else "@"  # USD's quotes of a path
         asset = f"{mark}./{rest.name}{mark}"
         dome = _DOME.format(asset=asset, intensity=repr(float(factor)), inpainted=repr(inpainted))
@@ -297,36 +313,27 @@ def _write_rest(
     Returns the share of the map's light that is filled in.
     """
     focal, members = typical_focal_length(training_cameras(run)), [light.members for light in lights]
-    options = {"without": members, "beyond": center.beyond}
-    rest = render_map(run, center.position, MAP_SIZE, "latlong", transform.rotation, focal, **options)
+    of_lights = torch.zeros(run.gaussian_count, device=run.device)
+    for index in members:
+        of_lights[index] = 1
+    rest, whole = (
+        render_map(run, center.position, MAP_SIZE, "latlong", transform.rotation, focal, **options)
+        for options in (
+            {"without": members, "beyond": center.beyond},
+            {"shares": of_lights, "beyond": center.beyond},
+        )
+    )
     hdr, directions, weight = rest.hdr, latlong(MAP_SIZE) @ transform.rotation, solid_angles(MAP_SIZE, "latlong")
-    # Dark lights are not the light around them.
-    source = np.where(_shows_lights(run, members, center, transform.rotation, focal), 0, rest.alpha)
+    assert whole.clipped is not None  # It is what `shares` is rendered to.
+    # Dark lights are neither the light around them nor directions that no photo covers.
+    source = np.where(whole.clipped > 0.5, 0, rest.alpha)
     inpainted = 0.0
     if unseen == "inpaint" and (source > COVERED).any():
-        added = (1 - rest.alpha[..., None]) * inpainted_light(hdr, source, directions, weight)
+        added = (1 - whole.alpha[..., None]) * inpainted_light(hdr, source, directions, weight)
         filled, total = (float((light.mean(2) * weight).sum()) for light in (added, hdr + added))
         inpainted = filled / max(total, 1e-30)
-        share = 100 * float((weight * (1 - rest.alpha)).sum() / weight.sum())
-        text = "%s: no photo shows %.0f %% of all directions; filled in from around them, %.0f %% of the map's light"
-        log.info(text, path.name, share, 100 * inpainted)
+        figures = path.name, covered_percent(whole.alpha, weight), 100 * inpainted
+        log.info("%s: photos cover %.0f %% of all directions; filled in: %.0f %% of the map's light", *figures)
         hdr = hdr + added
     write_multipart_exr(path, [map_part(run, hdr, rest.alpha, center, transform, axes)], overwrite=overwrite)
     return inpainted
-
-
-def _shows_lights(
-    run: Run, members: Sequence[torch.Tensor], center: MapCenter, to_scene: np.ndarray, focal: float
-) -> np.ndarray:
-    """Return [H, W] whether half of the light of a map's pixel and more comes from Gaussians of lights.
-
-    Measured in a coarser map, since what is filled in is smooth.
-    """
-    size = MAP_SIZE // 8
-    part = torch.zeros(run.gaussian_count, device=run.device)
-    for index in members:
-        part[index] = 1
-    options = {"focal_length": focal, "pixel_angle": 2 * np.pi / size, "beyond": center.beyond, "shares": part}
-    clipped = run.render_directions(center.position, latlong(size) @ to_scene, **options).clipped
-    assert clipped is not None  # It is what `shares` is rendered to.
-    return np.kron(clipped.cpu().numpy() > 0.5, np.ones((8, 8), bool))

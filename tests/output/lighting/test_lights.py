@@ -81,13 +81,30 @@ def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
         assert image[place] == pytest.approx(expected, abs=1e-3) and whole[place].max() > 1
 
 
+def test_a_sphere_around_the_place_stays_in_the_map(tmp_path, run, logged):
+    """As of a ceiling that clips, which is a sphere as wide as the room: from within it lights nothing."""
+    inside = (0.0, 0.0, 2.9)
+    write_lights(run, tmp_path / "all.usda", axes="scene", at=inside, unseen="black")
+    line = "light_1: the place that is lit lies within the sphere: "
+    assert f"{line}its light stays in the map of the rest" in logged
+    text = (tmp_path / "all.usda").read_text()
+    assert '"light_0"' in text and '"light_1"' not in text
+    names = [row["name"] for row in rows_of(run, tmp_path / "all.json", at=inside)]
+    assert names == ["light_0", "light_1"] and f"{line}a sphere lights nothing within" in logged
+    run.find_lights = lambda: LIGHTS[:1]
+    write_lights(run, tmp_path / "first.usda", axes="scene", at=inside, unseen="black")
+    with_ball, first = (read_hdr(tmp_path / f"{name}_rest.exr") for name in ("all", "first"))
+    assert with_ball.max() > 1
+    np.testing.assert_array_equal(with_ball, first)
+
+
 def test_unseen_directions_of_the_map_have_the_light_around_them(tmp_path, run, logged):
     write_lights(run, tmp_path / "lights.usda", axes="scene")
     channels, header = read_exr_channels(tmp_path / "lights_rest.exr")
     matrix = world_transform(run, "scene").matrix
     np.testing.assert_allclose(json.loads(header["sehdr:worldMatrix"]), matrix)
     filled, alpha = np.stack([channels[name] for name in "RGB"], axis=2), channels["A"]
-    assert "no photo shows 94 % of all directions" in (line := logged[-1])
+    assert "photos cover 6 % of all directions; filled in: " in (line := logged[-1])
     share = float(re.search(r"sehdr:inpaintedShare = (\S+)", (tmp_path / "lights.usda").read_text())[1])
     assert f"{100 * share:.0f} % of the map's light" in line and share > 0.5
     write_lights(run, tmp_path / "dark.usda", axes="scene", unseen="black")
