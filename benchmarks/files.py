@@ -17,13 +17,14 @@ import torch
 
 import sehdr_warp as sw
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.cameras.scene_cameras import common_focus, training_cameras
+from sehdr_warp.output.cameras.scene_cameras import training_cameras
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.export.proxy_mesh import proxy_mesh
 from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.world_transform import WorldTransform, file_transform, read_direction, world_transform
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import load_splats
+from sehdr_warp.scene.camera_focus import common_focus
 from sehdr_warp.splats import GaussianArrays, read_gaussians
 from sehdr_warp.subsets import evenly
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..scene import Camera
+from ..scene.camera_focus import camera_positions, map_center
 from ..scene.wide_camera import pixels_of_directions, steradians, typical_focal_length
 from ..subsets import every_nth
 from .confidence import RESIDUAL_WEIGHT
@@ -47,7 +48,7 @@ class Light:
         deviation: of log2 radiance, stops, of what photos clip; None if that was not measured. Edges and colors that do
             not clip do not count, because all its photos may err alike; where photos of half the exposure or less do
             not clip, it is at most MEASURED_STOPS, or what the scene differs from unclipped values.
-        share: of the light that reaches the middle of the training cameras, with what hides it from there.
+        share: of the light that reaches map_center(), with what hides it from there; 0 of what photos walk around.
         members: [K] int64, its Gaussians.
         measured: share of its deviation that is of Gaussians which photos of half the exposure or less show unclipped.
     """
@@ -117,9 +118,13 @@ def find_lights(
     candidates = _candidates(field, clipped, photos)
     if not len(candidates.index):
         return []
-    middle = np.mean([camera.position for camera, _ in views], axis=0)
-    reaches_middle = received_light(field, middle, photos.focal, degree=degree).light.mean(1)
-    total = max(float(reaches_middle.sum()), 1e-30)
+    cameras = [camera for camera, _ in views]
+    middle, center = camera_positions(cameras).mean(0), map_center(cameras)
+    reaches_middle = reaches_center = received_light(field, middle, photos.focal, degree=degree).light.mean(1)
+    if center.beyond:
+        around = {"beyond": center.beyond, "degree": degree}
+        reaches_center = received_light(field, center.position, photos.focal, **around).light.mean(1)
+    total, of_center = (max(float(light.sum()), 1e-30) for light in (reaches_middle, reaches_center))
     panoramas: dict[int, ReceivedLight] = {}
     lights = []
     for rows in connected_groups(candidates.positions, candidates.longest):
@@ -137,12 +142,9 @@ def find_lights(
             best = int(np.argmax(group.angles.sum(1) * (solid_angles(shape, photos.cameras) > 0)))
             if best not in panoramas:
                 panoramas[best] = _received_by(field, _panorama(photos.cameras[best].position, photos.focal), degree)
-            around = panoramas[best]
-            light_photos = _LightPhotos(
-                np.array([best]),
-                around.angles[core.index].sum(0, keepdim=True).cpu().numpy(),
-                around.light[group.index].sum(0, keepdim=True).cpu().numpy(),
-            )
+            angles, light = panoramas[best].angles[core.index], panoramas[best].light[group.index]
+            sums = (values.sum(0, keepdim=True).cpu().numpy() for values in (angles, light))
+            light_photos = _LightPhotos(np.array([best]), *sums)
         light_photos = light_photos.without_obstructed(solid_angles(shape, photos.cameras))
         if not len(light_photos.photos):
             continue  # A flat light at whose edge all cameras stand.
@@ -154,7 +156,7 @@ def find_lights(
         if radiance.mean() * shape.solid_angle(middle) < LEAST_SHARE * total:
             continue
         deviation, measured = _deviation_of_light(group)
-        share = float(reaches_middle[group.index].sum()) / total
+        share = float(reaches_center[group.index].sum()) / of_center
         bound = np.minimum(_certain_radiance(group, photos), radiance)
         lights.append(Light(shape, radiance, bound, deviation, share, group.index, measured))
     return sorted(lights, key=lambda light: -light.share)[:MOST_LIGHTS]

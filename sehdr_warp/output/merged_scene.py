@@ -10,9 +10,10 @@ from torch import Tensor
 from ..errors import SehdrError, refuse_paths
 from ..model.baking import field_of, gaussians_of, with_photo_filters
 from ..runs.run import RenderableScene, on_device
+from ..scene.camera_focus import camera_positions
 from ..splats import GaussianArrays
 from ..splats.arrays import join_gaussians
-from .cameras.scene_cameras import camera_positions, training_cameras
+from .cameras.scene_cameras import training_cameras
 from .world_transform import WorldTransform, photos_to_scene
 
 

@@ -23,10 +23,11 @@ from ..errors import InputError, SehdrError, refuse_paths
 from ..files import read_json, write_json
 from ..runs.values import ORIENTATION_FILE
 from ..scene import Camera
+from ..scene.camera_focus import common_focus
 from ..scene.gravity import is_pitch_known, typical_roll, up_direction
 from ..splats import STREAMED_SOG
 from ..splats.arrays import LARGEST_SCALE, similarity
-from .cameras.scene_cameras import common_focus, middle_index, split_or_all, training_cameras
+from .cameras.scene_cameras import middle_index, split_or_all, training_cameras
 
 if TYPE_CHECKING:
     from ..runs.run import RenderableScene

@@ -182,6 +182,18 @@ def test_a_light_that_every_photo_cuts_off_has_what_a_map_without_it_loses(targe
     assert light.share == pytest.approx(lost / total, rel=0.08)
 
 
+def test_a_walk_s_shares_are_of_the_light_around_what_it_looks_at():
+    """A statue as bright as white stands between the cameras, and a panel of four times that behind them."""
+    statue, wall = ball((0, 0, 0)) / 2, panel()
+    radiance = np.repeat([[1.0] * 3, [4.0] * 3], [len(statue), len(wall)], axis=0)
+    scene = field(np.concatenate([statue, wall]), radiance, 0.03)
+    turns = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    poses = [look_at((2 * np.sin(t), 0.2, 2 * np.cos(t)), (0, 0, 0), up=(0, -1, 0)) for t in turns]
+    photos = [(Camera(256, 192, 120.0, 120.0, 128.0, 96.0, pose), 1.0) for pose in poses]
+    lights = {light.shape.kind: light for light in find_lights(scene, torch.ones(scene.gaussians.count), photos)}
+    assert lights["rect"].share == pytest.approx(1) and lights["sphere"].share == 0
+
+
 @pytest.mark.parametrize("target", [(0, 0, 4.0), (4.0, 0, 0), (0, 0, -4.0), (0.5, -3.5, 0)])
 def test_panoramas_show_lights_in_all_directions(target):
     scene, clipped = field(ball(target), RADIANCE, 0.03), torch.ones(900)

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...scene import Camera
+from ...scene.camera_focus import common_focus
 from ...subsets import evenly
 from ..world_transform import scene_up
 from .paths import look_at_pose, moved, orbit, walk, walk_path
-from .scene_cameras import common_focus, surround, training_cameras
+from .scene_cameras import surround, training_cameras
 
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...scene import Camera
+from ...scene.camera_focus import camera_axes, camera_positions, common_focus
 from ...scene.gravity import up_direction
 from ...subsets import evenly
 from ..world_transform import scene_up, world_transform
@@ -23,7 +24,7 @@ from .framing import (
     widescreen_camera,
 )
 from .paths import look_at_pose, moved, walk
-from .scene_cameras import camera_axes, camera_positions, common_focus, middle_index, split_or_all, surround
+from .scene_cameras import middle_index, split_or_all, surround
 
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene

@@ -7,8 +7,9 @@ import numpy as np
 
 from ...errors import SehdrError
 from ...scene import Camera
+from ...scene.camera_focus import camera_axes, camera_positions, common_focus
 from ...scene.gravity import looks_down, up_direction
-from .scene_cameras import camera_axes, camera_positions, common_focus, is_full_circle
+from .scene_cameras import is_full_circle
 
 _LONGEST = 100_000  # More than an hour of film at 24 views a second is a slip of the hand
 # Cosine between the step from a photo to the next and their optical axes. A walk ahead has a median near 1, walks

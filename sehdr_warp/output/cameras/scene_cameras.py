@@ -7,6 +7,7 @@ import numpy as np
 
 from ...errors import SehdrError, did_you_mean
 from ...scene import Camera
+from ...scene.camera_focus import camera_positions
 from ...scene.gravity import up_direction
 from ...subsets import first_names
 
@@ -14,9 +15,6 @@ if TYPE_CHECKING:
     from ...runs.run import RenderableScene
 
 _ROUND_GAP = np.radians(120)  # A gap in azimuth smaller than this means that the photos go round the scene
-# Mean squared sine between optical axes below which they are parallel in effect: where they meet is then chance, as of
-# photos from the air that look down (6 degrees).
-_PARALLEL = np.sin(np.radians(6)) ** 2
 
 
 def training_cameras(run: "RenderableScene") -> list[Camera]:
@@ -42,17 +40,6 @@ def camera_named(run: "RenderableScene", name: str) -> Camera:
     return cameras[name]
 
 
-def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return the point [3] nearest to all optical axes (least squares); None if they are parallel or it lies behind."""
-    positions, forward = camera_positions(cameras), camera_axes(cameras, 2)
-    off_axis = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    matrix = off_axis.mean(axis=0)
-    if np.linalg.eigvalsh(matrix)[0] < _PARALLEL:
-        return None
-    focus = np.linalg.solve(matrix, (off_axis @ positions[:, :, None]).mean(axis=0)[:, 0])
-    return focus if np.median(np.sum((focus - positions) * forward, axis=1)) > 0 else None
-
-
 def middle_index(cameras: Sequence[Camera]) -> int:
     """Return the index of the camera nearest to the median position."""
     positions = camera_positions(cameras)
@@ -71,13 +58,3 @@ def is_full_circle(azimuths: np.ndarray) -> bool:
     """Return whether directions, in radians, go all around."""
     ordered = np.sort(azimuths)
     return bool(np.diff(ordered, append=ordered[0] + 2 * np.pi).max() < _ROUND_GAP)
-
-
-def camera_positions(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the places [n, 3] of cameras."""
-    return np.array([camera.position for camera in cameras]).reshape(-1, 3)
-
-
-def camera_axes(cameras: Sequence[Camera], axis: int) -> np.ndarray:
-    """Return the cameras' x, y or z axes [n, 3] in world coordinates."""
-    return np.stack([camera.world_to_camera[axis, :3] for camera in cameras])

@@ -14,6 +14,7 @@ from ...files import atomic_path
 from ...model.baking import field_of, fit_to_pictures, gaussians_of, psnr_of, with_photo_filters
 from ...response import response_by_name
 from ...runs.run import RenderableScene, on_device
+from ...scene.camera_focus import camera_positions
 from ...scene.exposure.times import shutter
 from ...splats import (
     STREAMED_SOG,
@@ -28,7 +29,7 @@ from ...splats import (
 )
 from ...subsets import every_nth, first_names
 from ..brackets import remove_earlier
-from ..cameras.scene_cameras import camera_positions, split_or_all, training_cameras
+from ..cameras.scene_cameras import split_or_all, training_cameras
 from ..images.display import display_gain
 from ..world_transform import WorldTransform, file_transform, is_y_down, photos_to_file, world_transform
 from .splat_edits import SplatEdits, most_visible, without_strays

@@ -10,9 +10,10 @@ from ...errors import SehdrError
 from ...model.visibility import contributions, count_views, mask_shares
 from ...runs.run import RenderableScene
 from ...scene import Camera, View
+from ...scene.camera_focus import camera_positions, common_focus
 from ...scene.wide_camera import painted_mask
 from ...splats import GaussianArrays
-from ..cameras.scene_cameras import camera_positions, common_focus, training_cameras
+from ..cameras.scene_cameras import training_cameras
 
 log = logging.getLogger(__name__)
 LEAST_OPACITY = 1 / 255  # Opacity below which 3DGS rasterizers, this one included, draw nothing

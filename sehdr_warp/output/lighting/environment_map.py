@@ -10,8 +10,9 @@ import numpy as np
 
 from ...errors import SehdrError, refuse_paths
 from ...files import check_absent
+from ...scene.camera_focus import camera_positions
 from ...scene.wide_camera import typical_focal_length
-from ..cameras.scene_cameras import camera_positions, training_cameras
+from ..cameras.scene_cameras import training_cameras
 from ..images.colorspace import color_space, from_rec709
 from ..images.display import exposure_for_white
 from ..images.exr import Part, as_data, write_multipart_exr, write_radiance

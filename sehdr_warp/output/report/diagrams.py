@@ -11,9 +11,10 @@ from PIL import Image
 
 from ...runs.run import RenderableScene
 from ...scene import Camera
+from ...scene.camera_focus import camera_positions
 from ...subsets import evenly
 from ..cameras.framing import visible_surface
-from ..cameras.scene_cameras import camera_positions, split_or_all
+from ..cameras.scene_cameras import split_or_all
 from ..html import EMPTY, join, markup
 from ..images.ldr_files import quantize
 from .charts import PANELS, training_points

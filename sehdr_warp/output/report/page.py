@@ -205,7 +205,7 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
     lead = (
         "Lamps, windows and other areas that photos clip, by their share of light. Their radiance is an estimate "
         "with a deviation; what photos show as white is certain. Places are upright, as in exported files. Share: of "
-        "the light at the middle of the cameras."
+        "the light at the default place of envmap."
     )
     if len(lights) > _MOST_LIGHTS:
         lead += f" The first {_MOST_LIGHTS} of {len(lights)}."
