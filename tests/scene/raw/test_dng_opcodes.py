@@ -5,6 +5,7 @@ import struct
 import numpy as np
 import pytest
 
+from sehdr_warp.errors import InputError
 from sehdr_warp.scene import load_scene
 from sehdr_warp.scene.raw.decode import read_raw
 from tests.make_scenes import write_frames
@@ -109,6 +110,37 @@ def test_bad_pixels_are_filled(tmp_path):
     np.testing.assert_allclose(light_of(tmp_path / "a.dng"), EVEN, rtol=2e-3)
 
 
+def test_pixels_of_a_constant_are_filled_and_no_others(tmp_path):
+    values = stored(mosaic(EVEN), white=65535.0)
+    values[40, 60], values[41, 61], values[2, 3] = 60000, 60000, 60000
+    values[70, 90] = 60001
+    tags = LEVELS | {50717: longs(65535), 51008: opcodes((4, struct.pack(">2I", 60000, 0)))}
+    write_tagged_dng(tmp_path / "a.dng", values, tags)
+    developed = light_of(tmp_path / "a.dng")
+    assert developed[70, 90].max() > 0.8
+    developed[64:76, 84:96] = TRUTH
+    np.testing.assert_allclose(developed, EVEN, rtol=2e-3)
+
+
+def test_a_table_maps_the_samples_of_an_area(tmp_path):
+    """Samples beyond its end become what white becomes, so they count as clipped."""
+    codes = np.arange(40000) / 65535
+    table = struct.pack(">I", len(codes)) + np.rint(65535 * codes**2).astype(">u2").tobytes()
+    light = np.sqrt(EVEN) * np.ones((HEIGHT, WIDTH, 1))
+    light[:, 100:] = 0.75
+    tags = LEVELS | {50717: longs(15000, 15000, 15000)}
+    body = area((HEIGHT // 2, WIDTH), planes=3) + table
+    write_tagged_dng(tmp_path / "a.dng", stored(light), tags | {51009: opcodes((7, body))})
+    developed = light_of(tmp_path / "a.dng")
+    np.testing.assert_allclose(developed[: HEIGHT // 2, :100], EVEN[: HEIGHT // 2, :100], rtol=2e-3)
+    assert (developed[: HEIGHT // 2, 100:] == 1).all()
+    np.testing.assert_allclose(developed[HEIGHT // 2 :], light[HEIGHT // 2 :], rtol=2e-3)
+    empty = 7, area((HEIGHT, WIDTH)) + struct.pack(">I", 0)
+    write_tagged_dng(tmp_path / "b.dng", stored(light), tags | {51009: opcodes(empty)})
+    with pytest.raises(InputError, match=r"b.dng: its DNG opcode 7 is damaged \(no table\)"):
+        light_of(tmp_path / "b.dng")
+
+
 def test_vignetting_and_distortion_after_demosaicing(tmp_path):
     x, y = 0.3 * (WIDTH - 1), 0.6 * (HEIGHT - 1)  # The farthest corner from there has radius 1.
     squared = ((Y - y) ** 2 + (X - x) ** 2) / ((WIDTH - 1 - x) ** 2 + y**2)
@@ -138,3 +170,17 @@ def test_distortion_by_a_polynomial_of_the_radius(tmp_path):
     light, far = light_of(tmp_path / "a.dng")[HEIGHT // 2], slice(WIDTH - 12, WIDTH - 4)
     expected = TRUTH * (1 + 0.8 * (X[0, far, None] - (WIDTH - 1) / 2) / WIDTH)
     np.testing.assert_allclose(light[far], expected, rtol=0.01)
+
+
+def test_distortion_of_a_fisheye(tmp_path):
+    """The pixel at r is found at t (k0 + k1 t^2 + k2 t^4 + k3 t^6), t = atan r, by the terms of its plane."""
+    terms = np.array([[0.9, 0.2, -0.3, 0.4], [1.1, -0.1, 0.2, -0.3], [1.0, 0.0, 0.0, 0.0]])
+    middle = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+    r = np.hypot(X - middle[0], Y - middle[1]) / np.hypot(*middle)
+    t = np.arctan(r)[..., None]
+    found = sum(terms[:, i] * t ** (2 * i + 1) for i in range(4)) / r[..., None]
+    ramp, expected = (EVEN * (1 + factor * (X - middle[0])[..., None] / WIDTH) for factor in (1, found))
+    body = struct.pack(">I14d", 3, *terms.ravel(), 0.5, 0.5)
+    tags = LEVELS | {50717: longs(15000, 15000, 15000), 51022: opcodes((2, body))}
+    write_tagged_dng(tmp_path / "a.dng", stored(ramp), tags)
+    np.testing.assert_allclose(light_of(tmp_path / "a.dng")[8:-8, 8:-8], expected[8:-8, 8:-8], rtol=2e-3)

@@ -7,7 +7,7 @@ import pytest
 
 from sehdr_warp.scene.sfm import pairs as sfm_pairs
 from sehdr_warp.scene.sfm import reconstruction
-from sehdr_warp.scene.sfm.pairs import likely_pairs, match_count, pairs_with
+from sehdr_warp.scene.sfm.pairs import from_one_place, likely_pairs, match_count, pairs_with
 
 
 def descriptors(count, seed, like=None, noise=0.0):
@@ -40,7 +40,8 @@ def database(tmp_path):
             image = pycolmap.Image(name=reconstruction.image_name(index), camera_id=camera.camera_id)
             image_id = opened.write_image(image)
             values = np.zeros((0, 128)) if index == 7 else np.concatenate([things[index], things[(index + 1) % 7][:20]])
-            large = np.tile(np.float32([8, 8, 4, 0, 0, 4]), (len(values), 1))
+            large = np.tile(np.float32([8, 8, 3, -3, 3, 3]), (len(values), 1))  # Turned by 45 degrees
+            large[::2, 2:4] *= -1  # Mirrored
             small = np.tile(np.float32([8, 8, 1, 0, 0, 1]), (30, 1))  # Of one thing in all images, but too fine
             opened.write_keypoints(image_id, np.concatenate([large, small]))
             codes = np.round(255 * np.concatenate([values, descriptors(30, 99)]) * 2).clip(0, 255).astype(np.uint8)
@@ -62,3 +63,15 @@ def test_each_photo_is_paired_with_those_that_match_it_best(database, monkeypatc
 def test_photos_without_a_place_are_paired_with_all(database):
     pairs = pairs_with({reconstruction.image_name(3)}, database)
     assert len(pairs) == 7 and all(reconstruction.image_name(3) in pair for pair in pairs)
+
+
+@pytest.mark.parametrize(("turned", "matches", "expected"), [(4, 60, True), (3, 60, False), (5, 59, False)])
+def test_a_turn_explains_four_of_five_pairs_of_many_matches_from_one_place(database, turned, matches, expected):
+    pycolmap = pytest.importorskip("pycolmap")
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    with pycolmap.Database.open(database) as opened:
+        for pair in range(5):
+            kind = kinds.PLANAR_OR_PANORAMIC if pair < turned else kinds.CALIBRATED
+            same = np.repeat(np.arange(matches, dtype=np.uint32)[:, None], 2, axis=1)
+            opened.write_two_view_geometry(1, 2 + pair, pycolmap.TwoViewGeometry(config=kind, inlier_matches=same))
+    assert from_one_place(database) is expected
