@@ -3,10 +3,15 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 
 import numpy as np
+import pytest
 from PIL import Image
 
+from sehdr_warp.scene import preprocess
+from sehdr_warp.synth.expose import write_radiance
 from tests.make_scenes import edit_transforms, load, pattern, write_blender, write_colmap
 
 
@@ -16,6 +21,33 @@ def test_photos_are_averaged_side_by_side(tmp_path):
     code = f"from sehdr_warp.scene import load_scene; load_scene({str(tmp_path)!r}, max_size=24, response='hdr-nerf')"
     environment = os.environ | {"SEHDR_THREADS": "8"}
     subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=120)
+
+
+@pytest.mark.parametrize("folder", [None, "hdr", "images"])
+def test_openexr_pictures_are_read_one_at_a_time(tmp_path, monkeypatch, folder):
+    """As truth of one photo or in place of photos: what their reader prints is suppressed for the whole process."""
+    write_colmap(tmp_path)
+    for photo in sorted((tmp_path / "images").iterdir())[: {None: 0, "hdr": 1}.get(folder)]:
+        (tmp_path / folder).mkdir(exist_ok=True)
+        write_radiance(tmp_path / folder / f"{photo.stem}.exr", np.full((48, 64, 3), 0.5, np.float32))
+        if folder == "images":
+            photo.unlink()
+    reading, most, lock, view = 0, [0], threading.Lock(), preprocess._Preprocessor.view
+
+    def slow(*job):
+        nonlocal reading
+        with lock:
+            reading += 1
+            most.append(reading)
+        time.sleep(0.05)
+        with lock:
+            reading -= 1
+        return view(*job)
+
+    monkeypatch.setattr(preprocess._Preprocessor, "view", slow)
+    monkeypatch.setenv("SEHDR_THREADS", "4")
+    load(tmp_path, response="auto" if folder == "images" else "srgb")
+    assert (max(most) > 1) is (folder is None)
 
 
 def test_a_lens_that_leaves_little_of_the_photos_is_named(tmp_path):

@@ -1,6 +1,7 @@
 """Files and lines of a training beside its state: figures, checkpoints, log."""
 
 import dataclasses
+import json
 import sys
 from dataclasses import replace
 
@@ -71,6 +72,38 @@ def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
     training.output.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
     training.train()
     assert "held-out photos scored best at iteration 2 (99.00 dB), now" in caplog.text
+
+
+@pytest.mark.parametrize("due", ["evaluate", "checkpoint"])
+def test_the_device_is_waited_for_before_held_out_photos_are_scored_or_a_state_is_saved(
+    scene, tmp_path, monkeypatch, due
+):
+    """So that the training's seconds, which both record, include all of its steps."""
+    fields = {"schedule.evaluate_at": [5] if due == "evaluate" else [], "plan.keep": ["schedule.checkpoint_every"]}
+    every = {"schedule.checkpoint_every": 5 if due == "checkpoint" else 99}
+    training = create_trainer(scene, tmp_path / "run", quick(length=10, **fields, **every), device="cpu")
+    calls = []
+    monkeypatch.setattr(training, "synchronize", lambda: calls.append("wait"))
+    for name in ("evaluate", "checkpoint"):
+        monkeypatch.setattr(training.output, name, lambda trainer, name=name: calls.append((name, trainer.iteration)))
+    while training.iteration < 9:
+        training.step()
+        training.output.after_step(training)
+    assert calls == ["wait", (due, 5)]
+
+
+@pytest.mark.parametrize(
+    ("earlier", "stays"), [({"train_seconds": 123.0}, True), ({"iteration": 3}, False), (None, False)]
+)
+def test_a_finished_run_that_is_resumed_keeps_its_summary_if_that_is_of_its_end(scene, tmp_path, earlier, stays):
+    train(scene, tmp_path / "run", quick(length=4), device="cpu")
+    summary = tmp_path / "run" / "summary.json"
+    whole = json.loads(summary.read_text())
+    summary.unlink() if earlier is None else summary.write_text(json.dumps(whole | earlier))
+    train(scene, tmp_path / "run", device="cpu", resume=True)
+    again = json.loads(summary.read_text())
+    assert again["iteration"] == 4 and again["finished"]
+    assert again["train_seconds"] == (123.0 if stays else whole["train_seconds"])
 
 
 def config(**overrides):
