@@ -122,6 +122,8 @@ def missing(path: Path | str, problem: str, remedy: str) -> InputError:
     """
     path, names = Path(path), list[str]()
     with suppress(OSError):
+        if path.is_symlink():
+            return InputError(path, f"is a link to {path.readlink()}, which is not there", "correct the link")
         names = [entry.name for entry in islice(path.parent.iterdir(), MOST_LISTED)]
     similar = nearest(path.name, names)
     return InputError(path, problem, f"did you mean {path.with_name(similar)}?" if similar else remedy)

@@ -67,6 +67,7 @@ def test_help_is_a_word_too(capsys):
     [
         ("train prak --out runs/x", "prak: not found; did you mean park?"),
         ("train elsewhere --out runs/x", "elsewhere: not found; give a folder of photos, or 'embedded'"),
+        ("train broken --out runs/x", "broken: is a link to gone, which is not there; correct the link"),
         ("render runs/caslte --out views", "runs/caslte: no such file or folder; did you mean runs/castle?"),
         ("render runs/castle --out x --colorspace srgb", "color space 'srgb' is an encoding"),
         ("envmap runs/castle --out x.exr --at 0,0", "point '0,0' is neither x,y,z"),
@@ -76,6 +77,7 @@ def test_help_is_a_word_too(capsys):
 def test_what_needs_no_scene_is_refused_before_one_is_opened(line, message, tmp_path, monkeypatch, capsys):
     for name in ("park", "runs/castle"):
         (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "broken").symlink_to("gone")
     monkeypatch.chdir(tmp_path)
     assert call(*line.split()) == 1
     assert message in capsys.readouterr().err

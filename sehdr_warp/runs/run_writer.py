@@ -219,6 +219,13 @@ class RunWriter(RunFolder):
         self._check_lock()
         write_json(self.extension, {"iterations": iterations, "finished_at": finished_at}, internal=True)
 
+    def set_photo_path(self, path: str) -> None:
+        """Write where the photos are now, if they have moved since the training began."""
+        info = read_object(self.info_file)
+        if info["data"].get("path") != path:
+            self._check_lock()
+            write_json(self.info_file, info | {"data": info["data"] | {"path": path}}, internal=True)
+
     def write_summary(self, values: dict) -> None:
         """Write times, memory and counts of the training; see SummaryValues."""
         self._check_lock()

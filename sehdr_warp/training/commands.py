@@ -312,12 +312,17 @@ def _photo_path(args: Train) -> str | None:
 
 def _load_arguments(args: Train, saved: LoadArguments | None) -> LoadArguments:
     """Return where the photos are and how they are loaded: by the command line, or else as in the run to resume."""
+    from ..scene import is_embedded
+
     options: dict = {"path": _photo_path(args)} | {name: getattr(args.scene, name) for name in SCENE_OPTIONS}
     if saved is not None:
         options = {name: saved.get(name) if value is None else value for name, value in options.items()}
         options |= {"views": views} if (views := saved.get("views")) else {}
     if options["path"] is None:
         raise SehdrError(f"{args.output.out}: does not say where its photos are; give SCENE")
+    if args.data is None and not is_embedded(options["path"]) and not Path(options["path"]).exists():
+        command = f"sehdr-warp train SCENE --resume --out {shlex.quote(str(args.output.out))}"
+        raise InputError(options["path"], "the photos of the run are no longer here", f"say where they are: {command}")
     return LoadArguments(**options)
 
 

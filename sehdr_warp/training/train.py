@@ -110,6 +110,8 @@ def create_trainer(
                 if config is not None and not states_iterations:
                     config = with_iterations_of(folder.read_config(), config)
                 trainer = _resumed_trainer(scene, config, device, ranks, folder)
+                if data is not None and (path := data.get("path")):
+                    folder.set_photo_path(path)
             else:
                 config, data = config or Config(), data or LoadArguments()
                 trainer = _new_trainer(scene, config, device, ranks, folder, data, shared, overwrite=overwrite)

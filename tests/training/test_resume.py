@@ -273,6 +273,20 @@ def test_resume_refuses_another_response_before_photos_are_read(photos, tmp_path
     assert "response.name = 'learned', but 'srgb' was asked for" in capsys.readouterr().err
 
 
+def test_photos_that_moved_are_asked_for_and_taken_from_their_new_place(photos, tmp_path, capsys):
+    moved, run = tmp_path / "moved photos", tmp_path / "my run"
+    shutil.copytree(photos, moved)
+    assert call("train", moved, "--out", run, "--device", "cpu", "--iterations", "1", "--response", "srgb") == 0
+    moved.rename(tmp_path / "new place")
+    resume = "--resume", "--out", run, "--device", "cpu", "--iterations", "2"
+    assert call("train", *resume) == 1
+    problem = f"{moved}: the photos of the run are no longer here; say where they are: sehdr-warp train SCENE --resume"
+    assert f"{problem} --out '{run}'" in capsys.readouterr().err
+    assert call("train", tmp_path / "new place", *resume) == 0
+    assert load_run(run).iterations == 2
+    assert call("eval", run, "--device", "cpu") == 0, "the run states the new place"
+
+
 def test_a_summary_is_of_the_last_checkpoint(scene, tmp_path):
     config = quick(**{"schedule.iterations": 4})
     run = train(scene, tmp_path / "run", config, device="cpu")
