@@ -176,4 +176,6 @@ def _load(device: str, path: Path) -> LightPrior:
         raise InputError(path, problem, remedy) from None
     if not all(bool(values.isfinite().all()) for values in tensors.values()):
         raise InputError(path, "holds weights that are not finite", remedy)
+    if not 0 < scale < math.inf:
+        raise InputError(path, f"states deviation_scale {scale:g}, which is not a positive number", remedy)
     return LightPrior(network.to(device), scale)

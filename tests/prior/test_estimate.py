@@ -123,12 +123,17 @@ def test_weights_come_back_as_they_were_written(tmp_path):
 
 def test_weights_that_cannot_be_used_are_one_line(tmp_path):
     broken = {name: value.clone() for name, value in LightNetwork(4).half().state_dict().items()}
+    for scale in ("nan", "inf", "-0.7", "0"):
+        save_file(broken, tmp_path / f"scale {scale}.safetensors", metadata={"deviation_scale": scale})
     broken["out.bias"][0] = math.nan
     save_file(broken, tmp_path / "nan.safetensors")
     save_file({"out.weight": torch.zeros(6, 4, 1, 1)}, tmp_path / "few.safetensors")
     (tmp_path / "text.safetensors").write_bytes(b"not weights" * 9)
     (tmp_path / "large.safetensors").write_bytes(bytes(3_000_001))
     names = {"missing": "missing", "text": "is not the weights", "few": "is not the weights"}
+    names |= dict.fromkeys(
+        (f"scale {scale}" for scale in ("nan", "inf", "-0.7", "0")), "deviation_scale .* not a positive number"
+    )
     for name, problem in (names | {"nan": "not finite", "large": "bytes"}).items():
         with pytest.raises(InputError, match=problem) as error:
             load_prior(path=tmp_path / f"{name}.safetensors")
