@@ -292,7 +292,7 @@ class Lights:
 def run_lights(args: Lights) -> None:
     """Run `sehdr-warp lights`."""
     from .lighting.lights import lights_table, write_lights
-    from .lighting.map_center import check_place
+    from .lighting.map_center import check_beyond, check_place
     from .lighting.unit import luminance_of_one
     from .world_transform import world_transform
 
@@ -305,6 +305,7 @@ def run_lights(args: Lights) -> None:
         print(lights_table(run.find_lights(), luminance_of_one(run), transform))
         return
     check_place(args.at)
+    check_beyond(args.beyond)
     run = open_run(args.run, args.device)
     for path in write_lights(run, args.out, **_options(args)):
         print(path)

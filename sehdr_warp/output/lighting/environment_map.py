@@ -18,7 +18,7 @@ from ..images.display import exposure_for_white
 from ..images.exr import Part, as_data, write_multipart_exr, write_radiance
 from ..picture_header import PictureHeader
 from ..world_transform import AXES, WorldTransform, world_transform
-from .map_center import MapCenter, find_center
+from .map_center import MapCenter, check_beyond, find_center
 from .shares import light_shares
 from .unit import EFFICACY, luminance_of_one
 
@@ -183,8 +183,7 @@ def check_map(path: Path, size: int | None, layout: str, axes: str, beyond: floa
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")
     if size is not None and (size < 16 or size % 2 or size > _LARGEST):
         raise SehdrError(f"size {size} is not usable; give an even number of pixels from 16 to {_LARGEST}")
-    if beyond is not None and not 0 <= beyond < np.inf:
-        raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the units of exported files")
+    check_beyond(beyond)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ from .environment_map import (
     render_map,
     solid_angles,
 )
-from .map_center import MapCenter, find_center
+from .map_center import MapCenter, check_beyond, find_center
 from .unit import luminance_of_one
 
 log = logging.getLogger(__name__)
@@ -127,6 +127,7 @@ def write_lights(
         raise SehdrError(f"{path}: lights are written as one of {', '.join(SUFFIXES)}; choose a suffix")
     if unseen not in UNSEEN:
         raise SehdrError(f"unseen {unseen!r} is not one of {', '.join(UNSEEN)}")
+    check_beyond(beyond)
     rest = path.with_name(f"{path.stem}_rest.exr")
     files = [path] if suffix == ".json" else [path, rest]
     for file in files:

@@ -48,6 +48,12 @@ def _numbers(at: str | tuple[float, float, float]) -> np.ndarray:
     return position
 
 
+def check_beyond(beyond: float | None) -> None:
+    """Raise SehdrError for a distance that is negative or not finite."""
+    if beyond is not None and not 0 <= beyond < np.inf:
+        raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the units of exported files")
+
+
 def check_place(at: str) -> None:
     """Raise SehdrError for a place that is nothing that `--at` takes, before a scene is opened."""
     if at != "center" and not at.startswith("camera:"):

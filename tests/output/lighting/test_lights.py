@@ -232,6 +232,11 @@ def test_what_cannot_be_written_is_refused(tmp_path, run):
         write_lights(run, tmp_path / "lights.txt")
     with pytest.raises(SehdrError, match="unseen 'grey' is not one of inpaint, black"):
         write_lights(run, tmp_path / "lights.usda", unseen="grey")
+    for beyond in (-1.0, np.nan):
+        with pytest.raises(SehdrError, match=f"beyond {beyond:g} is not a distance"):
+            write_lights(run, tmp_path / "lights.json", beyond=beyond)
+        with pytest.raises(SehdrError, match=f"beyond {beyond:g} is not a distance"):
+            run_lights(Lights(run=tmp_path / "no run", out=tmp_path / "lights.json", beyond=beyond))
     (tmp_path / "lights_rest.exr").write_text("mine")
     with pytest.raises(InputError, match="lights_rest.exr"):
         write_lights(run, tmp_path / "lights.usda")
