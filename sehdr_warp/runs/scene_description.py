@@ -174,7 +174,7 @@ def in_world_of_run(
     unlike |= (cosines < _LEAST_COSINE) | (distances > _MOST_MOVED)
     if unlike.any():
         problem = f"{unlike.sum()} of {len(views)} photos have other cameras than {run} was trained with"
-        remedy = "put photos and cameras back as they were then, or train again"
+        remedy = "use the photos, cameras and --max-size of then, or train again"
         names = first_names([view.name for view, is_other in zip(views, unlike, strict=True) if is_other])
         raise InputError(place, f"{problem}: {names}", remedy)
 

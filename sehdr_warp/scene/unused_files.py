@@ -83,7 +83,7 @@ def unused_notes(folder: Path, records: Sequence[ImageRecord], mentioned: Collec
         links = counted(len(broken), "link leads", "links lead")
         notes.append(f"{links} to no file: {first_names([file.name for file in broken])}")
     if others:
-        notes.append(f"not used, as files of kinds that are not read: {_by_suffix(others)}")
+        notes.append(f"not used, because files of these kinds are not read as photos: {_by_suffix(others)}")
     inside = (image.parent.parent for image in images if image.parent.is_relative_to(folder))
     above = {folder, *inside} - {folder.parent}
     geometry = sorted(place for each in above for place in each.iterdir() if place.name.lower() in GEOMETRY_FOLDERS)

@@ -47,7 +47,8 @@ def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_th
     turned[:3, 3] = -turned[:3, :3] @ first.position
     zoom = {"fx": 1.01 * first.fx, "fy": 1.01 * first.fy}
     zoomed = replace(scene.views[0], camera=replace(scene.views[0].camera, **zoom))  # In the world of the run
-    with pytest.raises(InputError, match="1 of 5 photos have other cameras than run was trained with: v_0"):
+    problem, remedy = "1 of 5 photos have other cameras than run was trained with: v_0", "cameras and max_size of then"
+    with pytest.raises(InputError, match=f"{problem}; use the photos, {remedy}"):
         in_world_of_run(replace(scene, views=(zoomed, *scene.views[1:])), cameras, 4.0, "run", "photos")
     changes = [{"world_to_camera": moved}, {"world_to_camera": turned}, zoom]
     for change in changes:

@@ -16,7 +16,7 @@ def test_photos_in_no_view_and_unread_kinds_are_named(tmp_path):
     scene = load(tmp_path)
     assert said(scene, "in no view") == ["2 photos of images are in no view: a.png, b.jpg"]
     assert said(scene, "not read") == [
-        "not used, as files of kinds that are not read: 1 MOV (film.mov), 2 XYZ (clip2.xyz ...)"
+        "not used, because files of these kinds are not read as photos: 1 MOV (film.mov), 2 XYZ (clip2.xyz ...)"
     ]
     # More than in the model, which was not found for all
     write_photos(tmp_path / "images", [f"c{i}.png" for i in range(9)], (64, 48))
