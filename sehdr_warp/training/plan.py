@@ -112,7 +112,7 @@ class Plan:
             spread = f"the photos' brightness differs by {self.facts.drift:.1f} stops and no exposure times are known"
             lines.append(f"plan: {spread}: if exposure changed between them, give their times in exposures.json")
         if code := self.facts.plateau:
-            problem = f"no photo is brighter than code {code} of 255, and many pixels have that code: they clip"
+            problem = f"many pixels have code {code} of 255, and hardly any is brighter: they clip"
             lines.append(f"plan: {problem}, but count as not clipped; export the photos with white at 255")
         is_measured = self.facts.unclipped or (self.config.loss.uses_hdr and self.facts.truths)
         if self.facts.clipped_when_dark >= CLIPPED and not is_measured:
