@@ -7,7 +7,7 @@ from pathlib import Path
 from ..subsets import counted, first_names
 from .dataparser import ImageRecord
 from .file_names import folders_named
-from .images.hdr_files import is_without_colors
+from .images.hdr_files import may_be_truth
 from .images.ldr_files import HDR_SUFFIXES, LDR_SUFFIXES
 from .photo_names import PhotoNames, fold_name
 
@@ -18,7 +18,7 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
     """Give each photo without truth the float picture that is named like it, in any layout.
 
     Truth lies beside the photo, or in `hdr/` or `exr/` of the data folder under a name of the photo (PhotoNames). Files
-    of passes such as depth, which hold no colors, are not truth.
+    of passes such as depth, which hold no colors, and views of a trained scene, as `render` writes them, are not truth.
 
     Args:
         records: the photos; truth that the set states itself stays.
@@ -43,7 +43,7 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         hdr = record.hdr
         if _may_have_truth(record):
             hdr = photo_names.file_of(record, files.values(), beside[record.image.parent])
-            hdr = None if hdr is not None and is_without_colors(hdr) else hdr
+            hdr = hdr if hdr is None or may_be_truth(hdr) else None
         result.append(replace(record, hdr=hdr))
     in_use, notes = {record.hdr for record in result}, []
     result = [record for record in result if record.is_own_truth or record.image not in in_use]
@@ -51,7 +51,9 @@ def assign_truth(records: Sequence[ImageRecord], folder: Path) -> tuple[list[Ima
         others = sorted(file.relative_to(place).as_posix() for file in files[place].values() if file not in in_use)
         if others:
             count = counted(len(others), "file that is", "files that are")
-            notes.append(f"{place.name}/ holds {count} the truth of no photo: {first_names(others)}")
+            rendered = sum(not may_be_truth(place / file) for file in others)
+            passes = f" ({rendered} rendered by sehdr-warp, or without color)" * bool(rendered)
+            notes.append(f"{place.name}/ holds {count} the truth of no photo{passes}: {first_names(others)}")
     return result, notes
 
 

@@ -8,9 +8,9 @@ from sehdr_warp.errors import InputError
 from tests.make_scenes import load, write_blender, write_colmap, write_llff
 
 
-def write_truth(path, size=(64, 48), light=0.5):
+def write_truth(path, size=(64, 48), light=0.5, **fields):
     path.parent.mkdir(parents=True, exist_ok=True)
-    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, **fields}
     OpenEXR.File(header, {"RGB": np.full((size[1], size[0], 3), light, np.float32)}).write(str(path))
 
 
@@ -66,3 +66,14 @@ def test_depth_is_no_truth(tmp_path, place):
     scene = load(tmp_path, holdout=0)
     assert len(scene.views) == 6 and not any(view.hdr is not None for view in scene.views)
     assert any("000.exr" in note for note in scene.notes)
+
+
+def test_what_render_wrote_beside_the_photos_is_no_truth(tmp_path):
+    """Else a training would compare itself with the one before."""
+    write_colmap(tmp_path)
+    for i in range(6):
+        write_truth(tmp_path / "hdr" / f"{i:03d}.exr", **{"sehdr:view": f"{i:03d}"} if i else {})
+    scene = load(tmp_path, holdout=0)
+    assert [view.hdr is not None for view in scene.views] == [True] + 5 * [False]
+    note = "hdr/ holds 5 files that are the truth of no photo (5 rendered by sehdr-warp, or without color): 001.exr"
+    assert any(line.startswith(note) for line in scene.notes)

@@ -65,16 +65,17 @@ def pixel_aspect(path: Path) -> float:
     return float(_exr_header(path)["pixelAspectRatio"]) if path.suffix.lower() == ".exr" else 1.0
 
 
-def is_without_colors(path: Path) -> bool:
-    """Return whether an OpenEXR file holds passes such as depth alone; False for one that cannot be read."""
+def may_be_truth(path: Path) -> bool:
+    """Return False for an OpenEXR file of passes such as depth alone, or that `render` wrote; True if unreadable."""
     if path.suffix.lower() != ".exr":
-        return False
+        return True
     try:
         with _exr_file(path, header_only=True) as file:
             endings = {ending for part in file.parts for ending in _channel_endings(part)}
+            is_rendered = any("sehdr:view" in part.header for part in file.parts)
     except InputError:
-        return False
-    return bool(endings) and not _has_colors(endings)
+        return True
+    return not is_rendered and (not endings or _has_colors(endings))
 
 
 def read_hdr(path: Path) -> np.ndarray:
