@@ -241,7 +241,8 @@ def uncertain_lights(lights: Sequence[Any]) -> list[str]:
     sentences = []
     if clipped:
         strongest = max(light.share for light in clipped.values())
-        strong = [light for light in clipped.values() if light.share >= STRONG * strongest]
+        # Photos walk around a light without a share.
+        strong = [light for light in clipped.values() if not light.share or light.share >= STRONG * strongest]
         radiance = float(np.max([light.radiance for light in strong]))
         bound = float(np.max([light.lower_bound for light in strong]))
         stops = max(1, math.ceil(math.log2(max(radiance, 1e-30) / max(bound, 1e-30))))

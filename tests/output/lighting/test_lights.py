@@ -223,6 +223,9 @@ def test_uncertain_lights_are_named_with_their_remedy(bound, remedy):
     table = lights_table([replace(LIGHTS[0], deviation=0.6, lower_bound=np.full(3, bound)), LIGHTS[1], glint])
     assert table.splitlines()[-1].startswith("light_0, light_2: uncertain by more than 0.5 stops")
     assert f"three photos about {remedy} than the darkest that clip there" in table
+    lamp = replace(LIGHTS[1], deviation=3.0, share=0.0, radiance=np.full(3, 64 * bound), lower_bound=np.full(3, bound))
+    table = lights_table([replace(LIGHTS[0], deviation=0.6, lower_bound=np.full(3, bound)), lamp])
+    assert "three photos about 6 stops darker than" in table, "a lamp that photos walk around is the one that is meant"
     table = lights_table([replace(light, deviation=0.6, measured=1.0) for light in LIGHTS])
     assert "three photos" not in table and "light_0, light_1: the scene differs by more than 0.5 stops" in table
 
