@@ -107,7 +107,7 @@ HEAVY = ("torch", "warp", "scipy", "matplotlib", "colour", "pycolmap", "OpenEXR"
     "words, most", [("train --help", 800), ("--help", 200), ("completion bash", 800), ("responses", 700)]
 )
 def test_help_is_quick_and_needs_no_torch(words, most):
-    """By what is imported, because seconds depend on the machine: it takes some 0.7, 0.1, 1.3 and 0.4."""
+    """Check what is imported, because seconds depend on the machine: it takes some 0.7, 0.1, 1.3 and 0.4."""
     code = f"import sys; from sehdr_warp import cli\ntry: cli.main({words.split()})\n"
     code += f"except SystemExit: print(len(sys.modules), *({{*{HEAVY}}} & {{*sys.modules}}))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

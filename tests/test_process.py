@@ -67,7 +67,7 @@ assert before == (gc.get_threshold(), len(gc.callbacks), gc.get_freeze_count())
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_while_a_pool_starts_a_thread_ends_the_process(number):
-    """Else the pool forgets the thread, and the end of the process waits for it."""
+    """The pool would otherwise forget the thread, and the end of the process would wait for it."""
     program = f"""
 import os, signal, sys, threading, time
 from concurrent.futures import ThreadPoolExecutor
@@ -141,7 +141,7 @@ def test_little_address_space_is_one_line_whatever_finds_none(tmp_path, mebibyte
 
 
 def test_names_are_utf8_in_any_locale(tmp_path):
-    """As the locale C has it where Python is told to believe that."""
+    """Names are UTF-8 even in the locale C, where Python may be set to expect ASCII."""
     environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     (tmp_path / "für.toml").write_text('base = "demo"\nseed = 7\n')
     done = subprocess.run(

@@ -22,7 +22,7 @@ MAX_PAIRS = 1 << 22  # Of Gaussians and pixels that contributions() looks at tog
 
 
 class CallerLists(NamedTuple):
-    """For each tile of the caller the Gaussians to draw there, front to back."""
+    """Gaussians to draw in each tile of the caller, front to back."""
 
     tile_size: int  # Edge of a tile in pixels
     starts: Tensor  # [rows, columns] int64, where each tile's list begins

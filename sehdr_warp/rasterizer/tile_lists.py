@@ -69,7 +69,7 @@ class EmitOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class TileLists:
-    """For each tile the Gaussians that touch it, front to back. All indices are int32."""
+    """Gaussians that touch each tile, front to back. All indices are int32."""
 
     tile_ranges: Tensor  # [tiles, 2] first intersection of each tile and one past its last
     gaussians: Tensor  # [M] the Gaussian of each intersection

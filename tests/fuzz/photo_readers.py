@@ -78,7 +78,7 @@ def make_places(folder: Path) -> None:
 
 
 def read_place(path: Path):
-    """By a flight of six photos, of which five state where they were."""
+    """Read the place of a photo beside a flight of six photos, of which five state where they were."""
     whole = path.with_name("b.jpg" if path.name == "a.jpg" else "a.jpg")
     views = []
     for number in range(6):

@@ -33,7 +33,7 @@ class TooSlow(BaseException):
 
 
 def forked(words, seconds: float) -> sandbox.Result:
-    """As sandbox.start, which takes half a second to load what this process has loaded."""
+    """Run words as sandbox.start does, which takes half a second to load what this process has loaded."""
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as told:
         child = os.fork()
         if child == 0:

@@ -45,7 +45,7 @@ def test_render_writes_hdr_previews_and_brackets(run, tmp_path, capsys):
 
 @pytest.mark.parametrize("kind, tolerance", [("png", 0.005), ("png16", 1e-4)])
 def test_simulated_photos_merge_back_to_the_rendered_radiance(run, tmp_path, kind, tolerance, capsys):
-    """From a trained run to photos and, by Debevec and Malik 1997, Eq. 6, back to its HDR views: RMS error."""
+    """Simulate photos of a run and merge them (Debevec and Malik 1997, Eq. 6): RMS error beside its HDR views."""
     out = tmp_path / "renders"
     evs = ",".join(str(ev) for ev in range(-8, 9, 2))
     flags = ("--device", "cpu", "--pixel", "float", "--ldr-brackets", kind)

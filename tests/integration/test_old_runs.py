@@ -24,7 +24,7 @@ def test_a_run_of_version_0_2_is_refused_with_what_to_do(command, tmp_path, capf
 
 
 def test_a_run_of_version_0_3_renders_exports_and_resumes(tmp_path):
-    """If the format of runs changes on purpose, refuse this run like that of 0.2, and store one of the new format."""
+    """Refuse this run like that of 0.2 if the format of runs changes on purpose, and store one of the new format."""
     run = shutil.copytree(DATA / "run-0.3", tmp_path / "run")
     assert call("render", run, "--out", tmp_path / "views", "--device", "cpu", "-q") == 0
     pictures = [read_hdr(path) for path in (tmp_path / "views" / "hdr").glob("*.exr")]

@@ -35,7 +35,7 @@ def test_public_names_load_and_are_documented(name):
 
 @pytest.mark.parametrize("name", sehdr_warp.__all__)
 def test_docstrings_name_every_argument_and_field_in_googles_form(name):
-    """Else the site of the pages takes what is said of them for something else."""
+    """The site of the pages would otherwise show their descriptions as plain text."""
     public_object = getattr(sehdr_warp, name)
     if inspect.isclass(public_object):
         section, names = (

@@ -111,7 +111,7 @@ def test_files_without_known_photos_are_written_as_they_are(tmp_path, run):
 
 @pytest.mark.parametrize("suffix", LOSSLESS_SUFFIXES)
 def test_a_small_file_keeps_its_mark_in_a_large_one(tmp_path, run, suffix):
-    """Else lamps, whose sizes include the filter, would be shown with up to twice their light."""
+    """Lamps, whose sizes include the filter, would otherwise be shown with up to twice their light."""
     small = read_gaussians(export(run, tmp_path / "a.compressed.ply", axes="scene"))
     write_gaussians(tmp_path / f"b{suffix}", small.with_colors(small.harmonics, COLORS.get(suffix, "display")))
     large = read_gaussians(tmp_path / f"b{suffix}")

@@ -118,7 +118,7 @@ class _Harm:
 
 
 def test_pickles_are_refused(tmp_path, monkeypatch):
-    """In every format whose library can hold one."""
+    """Try every format whose library can hold one."""
     monkeypatch.chdir(tmp_path)
     harm = np.array([_Harm()], object)
     (tmp_path / "set").mkdir()

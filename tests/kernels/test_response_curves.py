@@ -15,7 +15,7 @@ NAMES = [*response_names(), "gamma-3"]
 
 
 def exposures(response):
-    """From black to far above white, and both sides of the toe's end and of the clip point."""
+    """Return exposures from black to far above white, and both sides of the toe's end and of the clip point."""
     top = response.clip_exposure if response.clips else 50.0
     even = torch.linspace(0.0, 1.5 * top, 500, dtype=torch.float64)
     return torch.cat([even, torch.logspace(-9, 3, 500, dtype=torch.float64) * top, torch.tensor([-1.0, -1e-9])])

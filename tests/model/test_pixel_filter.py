@@ -59,7 +59,7 @@ def test_a_side_that_is_rounded_to_pixels_is_no_other_resolution():
 
 
 def test_opacity_times_area_stays():
-    """By the projection in float64 of the reference."""
+    """Compare with the reference's projection in float64."""
     generator = torch.Generator().manual_seed(0)
     means = torch.randn(50, 3, generator=generator, dtype=torch.float64) * 0.1 + torch.tensor([0, 0, 3.0])
     log_scales = torch.randn(50, 3, generator=generator, dtype=torch.float64) - 4

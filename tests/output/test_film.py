@@ -135,7 +135,7 @@ def test_rates_that_no_film_has_are_refused(tmp_path, fps):
 
 
 def test_small_hevc_films_leave_memory_whole(tmp_path):
-    """In a process whose allocator checks each block when it is freed."""
+    """Write in a process whose allocator checks each block when it is freed."""
     checker = "libc_malloc_debug.so.0"
     try:
         ctypes.CDLL(checker)

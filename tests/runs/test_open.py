@@ -170,7 +170,7 @@ def test_a_scene_that_python_loads_anew_is_trained_in_the_world_of_its_run(bare_
 
 
 def test_the_castle_goes_on_if_its_cameras_are_found_again(tmp_path, castle_photos, monkeypatch):
-    """By another seed, of all photos: of five, the focal length differs by up to 2.4 % between seeds."""
+    """Cameras are found by another seed from all photos: from five, the focal length differs by up to 2.4 %."""
     run = tmp_path / "run"
     assert call("train", castle_photos, "--out", run, *TRAIN.split(), "--iterations", 4) == 0
     monkeypatch.setattr(reconstruction, "SEED", reconstruction.SEED + 1)

@@ -62,7 +62,7 @@ def test_a_sparse_checkpoint_is_refused_by_its_length(run):
 
 
 def test_files_that_may_not_be_read_say_so(run, monkeypatch):
-    """As root reads everything, the system's answer is made up."""
+    """The system's answer is simulated, because root reads everything."""
     folder = RunFolder(run)
     listdir = os.listdir
 

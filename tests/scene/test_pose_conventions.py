@@ -176,7 +176,7 @@ def test_tiff_photos_are_compared_as_they_are_stored(tmp_path, photos, views):
 
 
 def test_masked_pixels_are_not_compared(tmp_path, photos, views):
-    """On a turntable the background stands still, whatever the poses."""
+    """The background of a turntable stands still, whatever the poses."""
     still = np.random.default_rng(0).integers(0, 255, (80, 80, 3), dtype=np.uint8)
     background = Image.fromarray(still).resize((LARGER * 160, LARGER * 160), Image.Resampling.BICUBIC)
     (tmp_path / "masks").mkdir()

@@ -37,7 +37,7 @@ def test_pixels_beyond_the_model_of_a_lens_do_not_count():
 
 @pytest.mark.parametrize("step", [(-0.5, 0.1, 0.2), (0.02, 0.01, 0.6)])
 def test_only_poses_that_see_the_points_in_front_of_both_cameras_fit(step):
-    """Of the four pairs of poses that have one epipolar geometry, the points lie behind a camera in three."""
+    """Four pairs of poses have one epipolar geometry; the points lie behind a camera in three of them."""
     lens = Lens("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0), Path("cameras.txt"))
     points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (100, 3))
     turn, step = Rotation.from_euler("xyz", (5, -10, 100), degrees=True).as_matrix(), np.array(step)

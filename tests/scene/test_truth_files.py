@@ -69,7 +69,7 @@ def test_depth_is_no_truth(tmp_path, place):
 
 
 def test_what_render_wrote_beside_the_photos_is_no_truth(tmp_path):
-    """Else a training would compare itself with the one before."""
+    """A training would otherwise compare itself with the one before."""
     write_colmap(tmp_path)
     for i in range(6):
         write_truth(tmp_path / "hdr" / f"{i:03d}.exr", **{"sehdr:view": f"{i:03d}"} if i else {})

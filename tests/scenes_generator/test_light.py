@@ -18,7 +18,7 @@ SCENES = [name for name in RECIPES if name in embedded_scenes()]
 
 @pytest.mark.parametrize("name", SCENES)
 def test_the_first_map_shows_what_the_nearest_view_does(name):
-    """In unit and direction; views are filtered by a denoiser, and some cameras stand aside of the place."""
+    """Units and directions agree; views are filtered by a denoiser, and some cameras stand aside of the place."""
     maps = read_light_maps(embedded_folder(f"embedded:{name}"))
     assert len(maps) == len(PLACES) and all(0.02 < each.coverage.mean() < 0.98 for each in maps)
     first = maps[0]

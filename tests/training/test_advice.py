@@ -170,7 +170,7 @@ def test_a_scene_that_fits_nowhere_blames_cameras_and_overlap_and_nothing_that_m
 
 
 def test_cameras_are_found_anew_from_all_photos():
-    """Not from one of the folders of a rig."""
+    """The command must not name one folder of a rig alone."""
     scene = toy_scene(4, 8)
     run = SimpleNamespace(path=Path("r"), summary=lambda: summary([22]), metrics=list)
     config = SimpleNamespace(plan=SimpleNamespace(keep=[]))

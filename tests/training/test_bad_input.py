@@ -16,7 +16,7 @@ SHORT |= {"plan.keep": tuple(name for name in SHORT if name != "response.name")}
 
 
 def decibels(run, scene) -> float:
-    """Of the run's photos against the scene's."""
+    """Return the PSNR of the run's photos against the scene's."""
     errors = [(run.render_ldr(v.camera, v.exposure_time).cpu().numpy() - v.image) ** 2 for v in scene.views]
     return float(-10 * np.log10(np.mean(errors)))
 

@@ -54,14 +54,14 @@ def test_steps_take_as_long_as_measured():
 
 
 def test_two_gpus_take_as_long_as_measured():
-    """On H100; the exchange was fitted to H200."""
+    """The times are of H100; the exchange was fitted to H200."""
     for row in rows("gpus", workers=2):
         step = step_seconds(row["width"] * row["height"], row["gaussians"]) + exchange_seconds(row["gaussians"], 2)
         assert error(1e3 * step / 2, row["amortized_ms"]) < 0.1
 
 
 def test_memory_is_as_measured():
-    """On captures, to most of which it was fitted; synthetic scenes, with smaller Gaussians, need less.
+    """The estimate was fitted to most of these captures; synthetic scenes, with smaller Gaussians, need less.
 
     Masks take four bytes a pixel beside the three of a photo.
     """

@@ -84,7 +84,7 @@ def test_a_run_begins_with_a_checkpoint_of_its_start(scene, trained, tmp_path):
 
 
 def copy_at_each_change(monkeypatch, folder: Path, place: Path) -> list[Path]:
-    """From now on copies the folder before each change of the disk: what a kill there would leave."""
+    """Copy the folder before each later change of the disk: it holds what a kill there would leave."""
     copies, at_it = [], []
 
     def copying(function):

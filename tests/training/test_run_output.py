@@ -78,7 +78,7 @@ def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
 def test_the_device_is_waited_for_before_held_out_photos_are_scored_or_a_state_is_saved(
     scene, tmp_path, monkeypatch, due
 ):
-    """So that the training's seconds, which both record, include all of its steps."""
+    """The training's seconds, which both record, must include all of its steps."""
     fields = {"schedule.evaluate_at": [5] if due == "evaluate" else [], "plan.keep": ["schedule.checkpoint_every"]}
     every = {"schedule.checkpoint_every": 5 if due == "checkpoint" else 99}
     training = create_trainer(scene, tmp_path / "run", quick(length=10, **fields, **every), device="cpu")

@@ -58,7 +58,7 @@ def test_training_killed_at_random(space, number):
 
 @pytest.mark.parametrize("number", range(KILLS))
 def test_training_killed_at_a_change_of_the_disk(space, number):
-    """Of a new run, or of one that takes the place of another, beside a file of the user's."""
+    """Kill a new run, or one that replaces another, beside a file of the user's."""
     kind, words = ("train anew", ANEW) if number % 2 else ("train", [*ANEW, "--overwrite"])
     changes = json.loads((space / "run" / "changes.json").read_text())[kind]
     if number % 2 == 0:

@@ -79,7 +79,7 @@ def test_names_of_photos_on_pages_and_terminals(space, name):
 
 @pytest.mark.parametrize("name", NAMED)
 def test_names_in_lists_on_terminals(space, name):
-    """Of photos that are not there."""
+    """List photos that are not there."""
     (space / "photos" / "exposures.json").write_text(json.dumps({NAMED[name]: 1, "r_0.png": 0.5}))
     tried(space, SHORT.replace(" -q", ""))
 
@@ -146,7 +146,7 @@ USES = {"train": ("photos",), "report": ("run", "photos"), "eval": ("run", "phot
 
 @pytest.mark.parametrize("name", OPENED)
 def test_what_commands_open(space, name):
-    """Of a user's files those that are named, or belong to what is named; the folder above is a user's."""
+    """Commands open only files that are named, or belong to what is named; the folder above is a user's."""
     places = [space / place for place in (*USES.get(name, ("run",)), "new", "seen", "cache", ".out", ".err", ".count")]
 
     def watch(event, arguments):

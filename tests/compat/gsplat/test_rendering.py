@@ -181,7 +181,7 @@ def test_splatfactos_call(device):
 
 
 def test_antialiasing_is_differentiated_whole(device):
-    """As torch's operations do it, by which covariances are projected."""
+    """Compare with gradients of torch's operations, by which covariances are projected."""
     leaves, place = scene(device)
     leaves = [leaf.detach().double().requires_grad_() for leaf in leaves]
     place = place._replace(viewmats=place.viewmats.double(), Ks=place.Ks.double())

@@ -74,7 +74,7 @@ def test_vertices_lie_on_the_surfaces(mesh):
 
 
 def test_a_ceiling_is_no_floor():
-    """In photos' coordinates with -Y up, as COLMAP's, what is level and has normals along +Y hangs above."""
+    """A level surface with normals along +Y hangs above, in photos' coordinates with -Y up, as COLMAP's."""
     run = BallOnFloor()
     run.up = UpDirection(np.array([0.0, -1.0, 0.0]), "gps")
     assert proxy_mesh(run, WorldTransform.identity(), resolution=24).ground is None

@@ -19,7 +19,7 @@ UTM = np.array([5e5, 5.4e6, 100.0])
 
 @pytest.fixture
 def run(tmp_path):
-    """In view of three cameras: one in the middle, one at the side, a faint one; and one behind the cameras."""
+    """Return a run with Gaussians in view of three cameras (in the middle, at the side, faint) and one behind them."""
     return run_of(tmp_path, splats([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, -20)], [0.9, 0.9, 0.002, 0.9]))
 
 
@@ -50,7 +50,7 @@ def test_regions(tmp_path, run):
 
 
 def test_the_most_visible_are_kept_and_refitted(tmp_path, logged):
-    """Of two Gaussians in one place the one that stays becomes denser; a far one that hardly shows goes."""
+    """One of two Gaussians in one place stays and becomes denser; a far one that hardly shows goes."""
     run = run_of(tmp_path, splats([(0, 0, 0), (0, 0, 0.01), (0, 0, -20)], [0.5, 0.4, 0.9], scale=0.3))
     assert export_means(run, tmp_path / "a.ply", max_gaussians=1) == [(0, 0, 0)]
     assert read_gaussians(tmp_path / "a.ply").opacities[0] > 0.55

@@ -82,7 +82,7 @@ def test_the_map_of_the_rest_lacks_the_lights_and_nothing_else(tmp_path, run):
 
 
 def test_a_sphere_around_the_place_stays_in_the_map(tmp_path, run, logged):
-    """As of a ceiling that clips, which is a sphere as wide as the room: from within it lights nothing."""
+    """A ceiling that clips becomes a sphere as wide as the room, which lights nothing within it."""
     inside = (0.0, 0.0, 2.9)
     write_lights(run, tmp_path / "all.usda", axes="scene", at=inside, unseen="black")
     line = "light_1: the place that is lit lies within the sphere: "

@@ -27,7 +27,7 @@ def gains():
 
 @pytest.fixture(scope="module")
 def points():
-    """Of a wall at z = 4."""
+    """Return points of a wall at z = 4."""
     return np.c_[np.random.default_rng(1).uniform(-1.5, 1.5, (400, 2)), np.full(400, 4.0)]
 
 

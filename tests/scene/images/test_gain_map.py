@@ -282,7 +282,7 @@ def test_maps_of_no_and_of_many_stops(tmp_path, stops):
 
 @pytest.mark.parametrize("behind", [b"", b"a film" * 50], ids=["alone", "motion photo"])
 def test_a_gain_map_without_a_multi_picture_index(tmp_path, behind):
-    """As editors leave it: its place is in the photo's XMP alone."""
+    """Editors leave such files: the map's place is in the photo's XMP alone."""
     light, base, gain = pair()
     second = jpeg_bytes(gain, [hdrgm()])
     items = [("Primary", 0), ("GainMap", len(second)), *([("MotionPhoto", len(behind))] if behind else [])]

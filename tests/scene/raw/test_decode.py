@@ -55,7 +55,7 @@ def test_raw_files_clip_by_channel_in_the_sensors_colors(tmp_path):
 
 @pytest.mark.parametrize("clips", [15892, 13000])
 def test_what_piles_up_below_the_stated_white_is_clipped(tmp_path, clips):
-    """As cameras do whose white level is known for their bits alone."""
+    """Some cameras state a white level for their number of bits alone."""
     pytest.importorskip("rawpy")
     light = np.random.default_rng(0).uniform(0.02, 1, (128, 96, 1)) * [0.9, 1, 0.8]
     light[:, 70:] *= 3
@@ -136,8 +136,9 @@ def test_files_that_are_no_photos_of_a_camera(tmp_path, shared, capfd):
 
 
 def test_raw_and_its_developed_jpeg_show_the_same_light(tmp_path, shared):
-    """To 2 % after one matrix, in means over 32 x 32 pixels that the JPEG exposes well: pixel by pixel two demosaicings
-    and 8 bits differ by more."""
+    """Compare to 2 % after one matrix, in means over 32 x 32 pixels that the JPEG exposes well.
+
+    Pixel by pixel, two demosaicings and 8 bits differ by more."""
     rawpy = pytest.importorskip("rawpy")
     file = shared / "data" / "raw" / "Blackmagic.dng"
     with rawpy.imread(str(file)) as raw:

@@ -120,7 +120,7 @@ def test_a_variable_frame_rate(tmp_path):
 
 
 def test_an_hlg_clip_of_a_room_becomes_a_scene(tmp_path):
-    """With cameras from structure from motion, the light that was encoded, and Rec.709 by the stream's primaries."""
+    """The scene has cameras from structure from motion, the encoded light, and Rec.709 by the stream's primaries."""
     pytest.importorskip("pycolmap")
     response, painted, frames = response_by_name("colour:ITU-R BT.2100 HLG"), walls(), []
     for i in range(12):
