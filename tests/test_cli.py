@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -187,6 +188,23 @@ def test_train_with_a_run_in_place_of_photos_suggests_resume(run, tmp_path, caps
     for word, hint in (("demo", "train embedded"), ("continue", "train --resume"), ("resume", "train --resume")):
         assert call(word, run) == 2
         assert hint in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [("photos", "--out", "run"), ("embedded", "--out", "photos/run")])
+def test_a_folder_without_rights_is_named_itself(tmp_path, words):
+    """The error must not blame a file that a run would have there. Root reads all unless it gives up that right."""
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos").chmod(0)
+    if os.access(tmp_path / "photos", os.R_OK) and shutil.which("setpriv") is None:
+        pytest.skip("setpriv, to run without root's rights, is not installed")
+    drop = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
+    command = [*drop, sys.executable, "-m", "sehdr_warp", "train", *words]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    (tmp_path / "photos").chmod(0o700)
+    place = {"photos": tmp_path / "photos", "embedded": "photos/run"}[words[0]]
+    assert done.returncode == 1
+    assert re.search(rf"^sehdr-warp: {place}: cannot be \w+ \(Permission denied\); check", done.stderr, re.MULTILINE)
 
 
 def test_a_training_ends_by_saying_what_to_type_next(run, capsys):

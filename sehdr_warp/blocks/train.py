@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,7 +31,7 @@ MOST_VIEWS = 200  # Held-out photos that the merged run is measured on
 
 def is_in_blocks(out: Path) -> bool:
     """Return whether a folder holds a training in blocks."""
-    return (out / FILE).is_file()
+    return os.path.isfile(out / FILE)
 
 
 def train_in_blocks(

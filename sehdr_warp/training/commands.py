@@ -138,7 +138,7 @@ def _check_options(args: Train) -> None:
         raise missing(Path(data), "not found", "give a folder of photos, or 'embedded'")
     if args.machine.gpus < 1:
         raise UsageError(f"--gpus {args.machine.gpus} is not 1 or more")
-    if data is not None and all(Path(data, name).is_file() for name in ("config.json", "run.json")):
+    if data is not None and all(os.path.isfile(os.path.join(data, name)) for name in ("config.json", "run.json")):
         steps = "" if options.iterations is None else f" --iterations {options.iterations}"
         command = f"sehdr-warp train --resume --out {shlex.quote(data)}{steps}"
         raise UsageError(f"{data}: is a run, not photos; {command} continues it")
