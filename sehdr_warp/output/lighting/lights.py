@@ -3,7 +3,7 @@
 import json
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -152,15 +152,15 @@ def write_lights(
     if not lights:
         text = "%s: no lights, because no area that photos clip emits light; the map holds all light"
         log.warning(text, run.path)
-    named = {light_name(index): light for index, light in enumerate(lights)}
-    if inside := [name for name, light in named.items() if light.shape.surrounds(center.position)]:
+    by_name = lights_by_name(lights)
+    if inside := [name for name, light in by_name.items() if light.shape.surrounds(center.position)]:
         remains = "its light stays in the map of the rest" if suffix == ".usda" else "a sphere lights nothing within"
         log.warning("%s: the place that is lit lies within the sphere: %s", first_names(inside, 5), remains)
     if suffix == ".usda":
-        named = {name: light for name, light in named.items() if name not in inside}
-    rows = [_describe(name, light, transform, factor) for name, light in named.items()]
+        by_name = {name: light for name, light in by_name.items() if name not in inside}
+    rows = [_describe(name, light, transform, factor) for name, light in by_name.items()]
     if suffix == ".usda":
-        inpainted = _write_rest(run, rest, list(named.values()), transform, axes, center, unseen, overwrite)
+        inpainted = _write_rest(run, rest, list(by_name.values()), transform, axes, center, unseen, overwrite)
         mark = "@@@" if "@" in rest.name else "@"  # USD's quotes of a path
         asset = f"{mark}./{rest.name}{mark}"
         dome = _DOME.format(asset=asset, intensity=repr(float(factor)), inpainted=repr(inpainted))
@@ -222,21 +222,26 @@ def lights_table(lights: Sequence[Any], unit: float | None = None, transform: Wo
     transform = transform or WorldTransform.identity()
     unit_name = "radiance" if unit is None else "cd/m^2"
     lines = [f"name        share  shape  {unit_name:>10}  at least  +- stops  place, size"]
-    for index, light in enumerate(lights):
+    for name, light in lights_by_name(lights).items():
         sides = light.shape.size[: 2 if light.shape.kind == "rect" else 1]
         size = " x ".join(f"{transform.scale * side:.3g}" for side in sides)
         place = ", ".join(f"{value:.3g}" for value in transform.points(light.shape.position))
         sure = "-" if light.deviation is None else f"{light.deviation:.2f}"
         radiances = (unit or 1.0) * np.mean([light.radiance, light.lower_bound], axis=1)
         figures = " ".join(f"{value:9.3g}" for value in radiances)
-        name_and_share = f"{light_name(index):8} {100 * light.share:5.1f} %"
+        name_and_share = f"{name:8} {100 * light.share:5.1f} %"
         lines.append(f"{name_and_share}  {light.shape.kind:6} {figures}  {sure:>8}  ({place}), {size}")
-    return "\n".join([*lines, *uncertain_lights(lights)])
+    return "\n".join([*lines, *uncertain_lights(lights_by_name(lights))])
 
 
-def uncertain_lights(lights: Sequence[Any]) -> list[str]:
+def lights_by_name(lights: Sequence[Any]) -> dict[str, Any]:
+    """Return lights, as from find_lights(), by their names."""
+    return {light_name(index): light for index, light in enumerate(lights)}
+
+
+def uncertain_lights(lights: Mapping[str, Any]) -> list[str]:
     """Return the sentences that name uncertain lights and what measures them; none without them."""
-    unsure = {light_name(index): light for index, light in enumerate(lights) if (light.deviation or 0) > UNCERTAIN}
+    unsure = {name: light for name, light in lights.items() if (light.deviation or 0) > UNCERTAIN}
     clipped = {name: light for name, light in unsure.items() if light.measured < 0.5}
     sentences = []
     if clipped:

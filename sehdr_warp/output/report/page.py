@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ... import __version__
-from ...model.lights import Light, light_name
+from ...model.lights import Light
 from ...progress import format_duration
 from ...runs.run import Run
 from ...scene import Scene
@@ -22,7 +22,7 @@ from ..images.ldr_files import jpeg
 from ..images.tonemap import fit_tone_map
 from ..images.ultra_hdr import MOST_STOPS, ultra_hdr
 from ..light_pictures import SPLIT, dial, img, jpeg_source, photo_for_display, side_choices, simulated_photo
-from ..lighting.lights import uncertain_lights
+from ..lighting.lights import lights_by_name, uncertain_lights
 from ..lighting.unit import luminance_of_one, read_light_unit
 from ..world_transform import WorldTransform, world_transform
 from .comparison import Comparison, first_picture
@@ -192,14 +192,18 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
 
     unit: cd/m^2 of a radiance of 1, None if it is not known.
     """
-    rows = []
-    for index, light in enumerate(lights[:_MOST_LIGHTS]):
+    rows, by_name = [], lights_by_name(lights)
+    # Photos walk around a light without a share, however bright it is.
+    without_share = [name for name, light in by_name.items() if not light.share][:_MOST_LIGHTS]
+    names = {*list(by_name)[: _MOST_LIGHTS - len(without_share)], *without_share}
+    listed = {name: light for name, light in by_name.items() if name in names}
+    for name, light in listed.items():
         radiances = (float((unit or 1.0) * np.mean(values)) for values in (light.radiance, light.lower_bound))
         sides = light.shape.size if light.shape.kind == "rect" else light.shape.size[:1]
         size = f"{SPACE}\N{MULTIPLICATION SIGN}{SPACE}".join(_rounded(transform.scale * side) for side in sides)
         place = ",\N{NO-BREAK SPACE}".join(map(_rounded, transform.points(light.shape.position)))
         figures = (f"{light.share:.1%}", *map(_rounded, radiances), number(light.deviation, 1))
-        rows.append((light_name(index), light.shape.kind, size, place, *figures))
+        rows.append((name, light.shape.kind, size, place, *figures))
     measure = "radiance" if unit is None else "cd/m\N{SUPERSCRIPT TWO}"
     titles = ("name", "shape", "size", "place", "share of light", measure, "certain at least", "deviation, stops")
     lead = (
@@ -208,8 +212,8 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
         "the light at the default place of envmap."
     )
     if len(lights) > _MOST_LIGHTS:
-        lead += f" The first {_MOST_LIGHTS} of {len(lights)}."
-    lead = " ".join([lead, *(f"{sentence}." for sentence in uncertain_lights(lights[:_MOST_LIGHTS]))])
+        lead += f" {len(listed)} of {len(lights)}: the largest shares, and lights that photos walk around."
+    lead = " ".join([lead, *(f"{sentence}." for sentence in uncertain_lights(listed))])
     return _section("Lights", lead, _rows(titles, rows, first_number=4))
 
 
