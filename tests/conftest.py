@@ -1,4 +1,4 @@
-"""What every test may ask for: devices, and the optional folder of larger real data."""
+"""Fixtures of all tests: devices, and the optional folder of larger real data."""
 
 import logging
 import os
@@ -51,7 +51,7 @@ def own_cache(tmp_path_factory):
 
 @pytest.fixture(autouse=True, scope="session")
 def no_flushes():
-    """What tests write need not outlive a power cut: some ten thousand flushes of a disk take their time."""
+    """Skip flushes: files of tests need not outlive a power cut, and some ten thousand flushes take their time."""
     real, os.fsync = os.fsync, lambda handle: None
     yield
     os.fsync = real
@@ -109,7 +109,7 @@ def castle_photos(shared, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def logged():
-    """What the package logs during a test, line by line; works also after the command line has set logging up."""
+    """Return the lines that the package logs during a test, also after the command line has set logging up."""
     lines, logger = [], logging.getLogger("sehdr_warp")
     handler = logging.Handler()
     handler.emit = lambda record: lines.append(record.getMessage())

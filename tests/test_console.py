@@ -1,4 +1,4 @@
-"""What a person sees while a training runs."""
+"""Progress and messages on the console while a training runs."""
 
 import io
 import logging

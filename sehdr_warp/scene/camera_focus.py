@@ -1,4 +1,4 @@
-"""What cameras look at together: the point where their axes meet, and the place from which to look around."""
+"""Find the point where the axes of cameras meet, and the place from which to look around."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

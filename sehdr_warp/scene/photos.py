@@ -30,7 +30,7 @@ _LEAST_SQUARE = 0.01  # Part by which the sides of a pixel may differ and count 
 _KINDS = {"encoded": "JPEG and similar photos", "raw": "RAW photos", "float": "float images"}
 _ENCODED = {b"\xff\xd8\xff": ("JPEG", ".jpg"), b"\x89PNG\r\n": ("PNG", ".png")}
 BRIGHTENING = 0.3, 0.4, 3 / 255
-"""Of brightened_codes(): midtone and least exponent as of training.matching, and the noise of a black background."""
+"""Values of brightened_codes(): midtone and least exponent as in training.matching, and noise of a black background."""
 
 
 def usable_photos(records: Sequence[ImageRecord]) -> tuple[list[ImageRecord], str, list[str]]:

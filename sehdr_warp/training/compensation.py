@@ -230,8 +230,8 @@ def _decision(
         figures.append(f"{compensation.white_balance:.2f} stops of white balance between photos")
     if components.vignetting:
         figures.append(f"{compensation.corner_loss:.0%} towards the corners")
-    kept = ", in addition to stated exposure times" if components.exposure else "; stated exposure times are kept"
-    choice = f"corrected in the photos{kept if times_known else ''}"
+    detail = ", in addition to stated exposure times" if components.exposure else "; stated exposure times are kept"
+    choice = f"corrected in the photos{detail if times_known else ''}"
     changed = _changed_light(compensation, matched.views) if times_known else ""
     reason = f"matched points differ by {', '.join(figures)}{changed}{_reach_note(matched)}"
     return Decision({}, choice, reason, COMPENSATION, always_log=True)

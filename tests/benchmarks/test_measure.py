@@ -1,4 +1,4 @@
-"""What the pages show is measured by the commands that they print."""
+"""Figures of the pages are measured by the commands that they print."""
 
 import json
 

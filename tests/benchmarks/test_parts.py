@@ -1,4 +1,4 @@
-"""What a training step's parts are told by, and what they are compared with."""
+"""Parts of a training step are recognized by their kernels, and compared with their lower bounds."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""How well responses are found, measured."""
+"""Errors of estimated responses are measured."""
 
 from types import SimpleNamespace
 

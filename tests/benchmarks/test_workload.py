@@ -1,4 +1,4 @@
-"""What the block kernels have to do is counted as they do it."""
+"""Work of the block kernels is counted as they do it."""
 
 import torch
 import warp as wp
@@ -15,7 +15,7 @@ def test_pairs_are_counted_as_the_block_kernels_blend_them(device, monkeypatch):
     pose, lens = scene.world_to_camera, scene.intrinsics
 
     def counted(opacities, grown=0.0):
-        """What is counted, and the warps that have a pixel which a Gaussian colors, were it alone."""
+        """Return the counts, and the warps that have a pixel which a Gaussian would color if it were alone."""
         gaussians = means, log_scales + grown, quaternions, opacities, features
         with monkeypatch.context() as blocks:
             blocks.setattr(wp.config, "enable_cpu_blocks", device == "cpu")

@@ -1,4 +1,4 @@
-"""What each protocol forgives, and what it costs to be wrong in scale."""
+"""Protocols of evaluation: which errors of scale each ignores, and what the others cost."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Whether confidence ranks errors: correlations that are known beforehand."""
+"""Rank correlation of confidence and errors, for values whose correlation is known."""
 
 import pytest
 import torch

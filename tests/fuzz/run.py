@@ -34,23 +34,23 @@ class TooSlow(BaseException):
 
 def forked(words, seconds: float) -> sandbox.Result:
     """Run words as sandbox.start does, which takes half a second to load what this process has loaded."""
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as told:
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         child = os.fork()
         if child == 0:
             code = 1
             try:
-                os.dup2(out.fileno(), 1), os.dup2(told.fileno(), 2)
+                os.dup2(out.fileno(), 1), os.dup2(err.fileno(), 2)
                 signal.alarm(int(seconds) + 1)
                 code = sandbox.main(*words)
             finally:
                 os._exit(code)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        out.seek(0), told.seek(0)
-        return sandbox.Result(code, out.read(), told.read())
+        out.seek(0), err.seek(0)
+        return sandbox.Result(code, out.read(), err.read())
 
 
 def fork_server():
-    """What stands for sandbox.start: a copy of this process as it is now forks for each sandbox.
+    """Replace sandbox.start: a copy of this process as it is now forks for each sandbox.
 
     Decoders that a process has used leave threads and locks behind, which do not survive its fork.
     """
@@ -140,8 +140,9 @@ def _child(pipe, name: str, folder: Path, options, first: int, inputs: int) -> N
 
 
 def run_reader(name: str, folder: Path, inputs: int, options) -> tuple[int, dict[str, list]]:
-    """How many inputs one reader was given, and of each kind of finding the first index, its words, and the number; a
-    new process after a death."""
+    """Return the number of inputs that one reader got, and of each kind of finding the first index, words, and number.
+
+    A new process starts after a death."""
     tried, findings = 0, {}
 
     def note(index: int, finding: str) -> None:
@@ -174,8 +175,8 @@ def run_reader(name: str, folder: Path, inputs: int, options) -> tuple[int, dict
     return tried, findings
 
 
-def told(command: str) -> dict:
-    """How a report's result says where figures are from."""
+def provenance_of(command: str) -> dict:
+    """Return machine, versions and command of a result, as a report's page needs them."""
     import torch
 
     from benchmarks.results import new_result
@@ -184,17 +185,17 @@ def told(command: str) -> dict:
     return {"command": command} | {name: result[name] for name in ("date", "machine", "notes")}
 
 
-def keep(path: Path, **values) -> None:
-    """Puts values into a JSON file beside those that are there."""
-    path.write_text(json.dumps(kept(path) | values, indent=1) + "\n")
+def store_values(path: Path, **values) -> None:
+    """Write values into a JSON file beside those that it holds."""
+    path.write_text(json.dumps(read_values(path) | values, indent=1) + "\n")
 
 
-def kept(path: Path) -> dict:
+def read_values(path: Path) -> dict:
     return json.loads(path.read_text()) if path.exists() else {}
 
 
 def share(name: str, inputs: int) -> int:
-    """How many of so many inputs a reader gets: all take about as long."""
+    """Return the number of inputs that a reader gets of so many: all readers take about as long."""
     return max(1, round(inputs / READERS[name].cost / sum(1 / reader.cost for reader in READERS.values())))
 
 
@@ -222,6 +223,6 @@ def main() -> int:
                 print(f"    {count:6} x {finding} (first: index {index})", flush=True)
             rows.append({"reader": name, "inputs": tried, "seed": options.seed, "findings": len(findings)})
             if options.json:
-                keep(options.json, fuzz=kept(options.json).get("fuzz", []) + rows[-1:])
+                store_values(options.json, fuzz=read_values(options.json).get("fuzz", []) + rows[-1:])
     print(f"{sum(row['inputs'] for row in rows)} inputs, {sum(row['findings'] for row in rows)} kinds of findings")
     return int(any(row["findings"] for row in rows))

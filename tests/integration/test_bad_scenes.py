@@ -116,7 +116,7 @@ def test_a_name_outside_is_that_of_a_missing_photo(data, name):
 
 
 def put(at: int, layout: str, *values):
-    """What packs values over a file's bytes from `at` on."""
+    """Return a function that packs values over a file's bytes from `at` on."""
     new = struct.pack(layout, *values)
     return lambda content: content[:at] + new + content[at + len(new) :]
 
@@ -175,7 +175,7 @@ def _huge_window(path):
 
 
 def photo(content):
-    """What puts bytes, or what is made of the photo's own, in the place of one photo."""
+    """Return a function that replaces one photo by bytes, or by a function of its own bytes."""
 
     def change(data):
         path = data / "images" / "002.png"

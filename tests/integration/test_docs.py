@@ -1,4 +1,4 @@
-"""What the pages say, held: examples run, command lines parse, links lead somewhere, versions agree."""
+"""Check the pages: examples run, command lines parse, links lead somewhere, versions agree."""
 
 import os
 import re

@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_stub_and_lazy_names_agree():
-    """What editors read in the stub is what the package loads, each name from the same place."""
+    """The stub, which editors read, names each public object where the package loads it from."""
     stub = ast.parse((ROOT / "sehdr_warp" / "__init__.pyi").read_text())
     homes = {alias.name: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names}
     (declared,) = (node.value for node in stub.body if isinstance(node, ast.Assign) and node.targets[0].id == "__all__")

@@ -51,8 +51,8 @@ Names in a data set stay inside: names_of_a_set_stay_inside links_that_lead_out_
 OpenUSD and MATLAB files, and videos: bounds counts_beyond_the_file_take_no_memory
 A stage that refers to files: a_stage_leads_to_no_other_folder a_clip_that_names_other_files_is_refused
     clips_that_were_made
-LUTs of a config must be files: luts_that_cannot_be_read_are_told_in_a_line luts_that_were_made archives_of_configs
-The caches: damaged_modules_go_and_are_told_once frames_are_kept_in_the_cache
+LUTs of a config must be files: luts_that_cannot_be_read_are_named_in_a_line luts_that_were_made archives_of_configs
+The caches: damaged_modules_go_and_are_logged_once frames_are_kept_in_the_cache
 The processes of one training: ranks_stay_alike_and_one_can_go_on
 It reads the paths: what_commands_open
 It writes only to the paths: names_of_output what_commands_open
@@ -159,7 +159,7 @@ def test_the_viewer_listens_on_this_machine_alone():
 
 
 def test_the_trial_sees_programs_and_connections(monkeypatch):
-    """What the trial's children may not do, by the audit events that Python raises for it."""
+    """Check what the trial's processes may not do, by the audit events that Python raises for it."""
     lines = []
     monkeypatch.setattr(harness.os, "write", lambda number, text: lines.append(text))
     monkeypatch.setattr(sys, "argv", ["sehdr-warp", "render"])

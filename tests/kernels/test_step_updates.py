@@ -1,4 +1,4 @@
-"""What a training does beside rendering: Adam, the judgement of a step, gradient statistics, position noise."""
+"""Kernels of a training step beside rendering: Adam, decision on a step, gradient statistics, position noise."""
 
 import math
 from itertools import product

@@ -1,4 +1,4 @@
-"""What a scene leaves out of its photos is named: a lamp that was never built, and nothing where all is there."""
+"""Regions of photos that a scene does not explain: a lamp that is missing, and none in a complete scene."""
 
 import json
 from dataclasses import replace
@@ -27,7 +27,7 @@ def without_lamp(scene):
     return replace(scene, views=tuple(views))
 
 
-def test_a_missing_lamp_is_named_and_told(tmp_path, caplog):
+def test_a_missing_lamp_is_named_and_logged(tmp_path, caplog):
     scene = wall_and_lamp()
     run = train(without_lamp(scene), tmp_path / "run", CONFIG, device="cpu")
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["unexplained"]["regions"] == 0

@@ -1,4 +1,4 @@
-"""What Blender makes of our files; run by Python with bpy: blender_script.py FOLDER, prints JSON."""
+"""Read our files with Blender; run by Python with bpy: blender_script.py FOLDER, prints JSON."""
 
 import json
 import math

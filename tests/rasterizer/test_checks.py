@@ -1,4 +1,4 @@
-"""What does not fit the public operations is answered in one line that names it."""
+"""Inputs that do not fit the public operations end in one line that names them."""
 
 import numpy as np
 import pytest

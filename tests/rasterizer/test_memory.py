@@ -33,7 +33,7 @@ from .scenes import random_scene
         (ValueError("size"), None),
     ],
 )
-def test_failed_allocations_are_told_from_other_errors(error, is_allocation):
+def test_failed_allocations_are_distinguished_from_other_errors(error, is_allocation):
     assert failed_allocation(error) == is_allocation
 
 

@@ -141,7 +141,7 @@ def test_channels_that_differ_are_said_and_the_curve_can_be_read(tmp_path, logge
     assert stops_off(sw.calibrate(folder, times=times, channel="red"), response_by_name("srgb")) < 0.05
 
 
-def test_the_curve_is_told_as_a_shell_reads_it(tmp_path, capsys):
+def test_the_curve_is_printed_as_a_shell_reads_it(tmp_path, capsys):
     times = (0.25, 1.0, 4.0)
     folder = write_stack(tmp_path / "stack", photograph(response_by_name("srgb"), light(), times), times)
     run_calibrate(Calibrate(stack=folder, out=tmp_path / "my camera.csv"))

@@ -15,7 +15,7 @@ from ..found_cameras import TURN, in_other_world
 from ..training.toy import toy_scene
 
 
-def test_photos_of_one_name_in_several_folders_are_told_apart():
+def test_photos_of_one_name_in_several_folders_stay_apart():
     """Cameras number photos anew in each folder of a card, as DCIM/100CANON and DCIM/101CANON."""
     scene = toy_scene(3, 8)
     files = ("100CANON/IMG_1.JPG", "101CANON/IMG_1.JPG", "101CANON/IMG_2.JPG")

@@ -1,4 +1,4 @@
-"""What cameras look at together."""
+"""The point that cameras look at together."""
 
 import numpy as np
 import pytest

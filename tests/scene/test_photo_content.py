@@ -34,20 +34,20 @@ def test_codes_of_fewer_bits_in_files_of_16_are_named(tmp_path, bits, response):
         assert note.endswith(f"multiply their codes by {factor}")
 
 
-@pytest.mark.parametrize(("inner", "told"), [(1.0, True), (0.6, False), (2.0, False)])
-def test_circles_in_black_frames_are_told_of(tmp_path, inner, told):
+@pytest.mark.parametrize(("inner", "is_named"), [(1.0, True), (0.6, False), (2.0, False)])
+def test_circles_in_black_frames_are_named(tmp_path, inner, is_named):
     """An object before a black backdrop is no circle to its border."""
     radius = np.hypot(*np.meshgrid(np.linspace(-4 / 3, 4 / 3, 320), np.linspace(-1, 1, 240)))
     photos = [tmp_path / f"{i}.jpg" for i in range(3)]
     for i, photo in enumerate(photos):
         codes = np.maximum(pattern(320, 240, i), 60) * (radius < inner)[..., None]
         Image.fromarray(codes.astype(np.uint8)).save(photo)
-    assert [note[:32] for note in frame_notes(photos)] == ["photos are circles in black fram"] * told
+    assert [note[:32] for note in frame_notes(photos)] == ["photos are circles in black fram"] * is_named
 
 
 @pytest.mark.parametrize(("top", "left", "bars"), [(30, 0, "top, bottom"), (0, 40, "right, left"), (2, 2, "")])
 @pytest.mark.parametrize("color", ["black", "white"])
-def test_bars_are_told_of(tmp_path, color, top, left, bars):
+def test_bars_are_named(tmp_path, color, top, left, bars):
     """Frames of wide films have them; a backdrop around an object ends elsewhere in each photo."""
     bar = 255 if color == "white" else 0
     photos = [tmp_path / f"{i}.jpg" for i in range(3)]

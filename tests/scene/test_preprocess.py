@@ -25,7 +25,7 @@ def test_photos_are_averaged_side_by_side(tmp_path):
 
 @pytest.mark.parametrize("folder", [None, "hdr", "images"])
 def test_openexr_pictures_are_read_one_at_a_time(tmp_path, monkeypatch, folder):
-    """What their reader prints is suppressed for the whole process, so only one runs: for truth and for photos."""
+    """The output of their reader is suppressed for the whole process, so only one runs: for truth and for photos."""
     write_colmap(tmp_path)
     for photo in sorted((tmp_path / "images").iterdir())[: {None: 0, "hdr": 1}.get(folder)]:
         (tmp_path / folder).mkdir(exist_ok=True)

@@ -31,7 +31,7 @@ def test_a_response_that_is_a_guess_is_noted(tmp_path):
         (("NIKON D70\0\0", "NIKON D70"), []),
     ],
 )
-def test_photos_of_several_cameras_are_told_of(tmp_path, cameras, notes):
+def test_photos_of_several_cameras_are_named(tmp_path, cameras, notes):
     write_colmap(tmp_path)
     for number, camera in enumerate(cameras):
         path, tags = tmp_path / "images" / f"{number:03d}.png", Image.Exif()
@@ -54,7 +54,7 @@ def test_the_response_is_chosen_from_codes_as_photographed():
     assert load_scene("embedded", max_size=40, response=named.response).response is named.response
 
 
-def test_a_guess_is_told():
+def test_a_guess_is_logged():
     ramp = np.rint(255 * np.linspace(0.1, 0.9, 64)[None, :, None] * np.ones((64, 1, 3))).astype(np.uint8)
     note = select_for_codes([ramp], [None], "posterior", ()).note
     assert "is a guess: curves that explain the photos as well differ from it by" in note

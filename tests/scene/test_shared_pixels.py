@@ -41,8 +41,8 @@ def test_only_poses_that_see_the_points_in_front_of_both_cameras_fit(step):
     lens = Lens("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0), Path("cameras.txt"))
     points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (100, 3))
     turn, step = Rotation.from_euler("xyz", (5, -10, 100), degrees=True).as_matrix(), np.array(step)
-    seen = points, points @ turn.T + step
-    places = [500 * each[:, :2] / each[:, 2:] + (320, 240) for each in seen]
+    second_points = points @ turn.T + step
+    places = [500 * each[:, :2] / each[:, 2:] + (320, 240) for each in (points, second_points)]
     shared = SharedPixels((0, 1), (lens, lens), (places[0], places[1]))
     twist = Rotation.from_rotvec(np.pi * step / np.linalg.norm(step)).as_matrix()
     for rotation, translation in ((turn, step), (turn, -step), (twist @ turn, step), (twist @ turn, -step)):

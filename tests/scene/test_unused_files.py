@@ -1,4 +1,4 @@
-"""What a set holds and does not use is named: frames, models, photos, kinds of files; and names that tools write."""
+"""Notes on files of a set that are not used: frames, models, photos, kinds of files; and names that tools write."""
 
 import shutil
 

@@ -50,7 +50,7 @@ def test_refusals(tmp_path, truth):
 
 def test_a_set_of_another_recipe_is_refused(truth):
     class Traces:
-        """As much of Mitsuba as is asked before the set is known."""
+        """The part of Mitsuba that is used before the set is known."""
 
         variant = staticmethod(lambda: "llvm_ad_rgb")
 

@@ -23,7 +23,7 @@ def summary(decibels, regions=0, stops=2.0):
     return {"iteration": 90, "metrics": metrics, "unexplained": {"regions": regions, "photos": 3, "worst": worst}}
 
 
-def test_a_training_that_still_gains_is_told_to_go_on():
+def test_a_training_that_still_gains_is_advised_to_continue():
     [line] = advice(Path("runs/my run"), summary([20, 22, 23, 24]), 50)
     assert line.endswith("sehdr-warp train --resume --out 'runs/my run' --iterations 180") and "2.0 dB" in line
 

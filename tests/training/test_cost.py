@@ -135,7 +135,7 @@ def test_gpus_that_gain_nothing_are_not_listed_unless_they_are_named():
     assert len(choices(long, long, 1, None)) == 5
 
 
-def test_small_scenes_are_told_that_they_gain_nothing():
+def test_small_scenes_get_a_line_that_more_gpus_gain_nothing():
     gpu = torch.device("cuda", 0)
     assert "too few to gain" in gain_of_ranks(2, 2_000, 10_000, 4000, gpu)
     large = gain_of_ranks(2, 1_000_000, 2_000_000, 30_000, gpu)

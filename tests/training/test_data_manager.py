@@ -41,7 +41,7 @@ def test_ranks_share_one_order():
         assert [rank.next() for rank in ranks] == [alone.next(), alone.next()]
 
 
-def test_what_follows_is_told_where_it_is_drawn():
+def test_the_next_photo_is_known_when_one_is_sampled():
     order = PhotoSampler(3, seed=0)
     assert order.peek() is None
     for _ in range(7):

@@ -48,7 +48,7 @@ def agent(node: int, port: int, *words) -> subprocess.Popen:
 
 
 def together(agents, seconds: float = 150) -> list[str]:
-    """What agents print, once both have ended well."""
+    """Return what agents print, once both have ended well."""
     try:
         printed = [each.communicate(timeout=seconds)[0] for each in agents]
     finally:

@@ -52,7 +52,7 @@ def test_tensorboard_gets_the_figures_of_the_last_training_in_a_folder(scene, tm
     assert notes.read_text() == "mine"
 
 
-def test_held_out_figures_are_told_in_words(scene, tmp_path, logged):
+def test_held_out_figures_are_logged_in_words(scene, tmp_path, logged):
     short = quick(**{"schedule.iterations": 4})
     last = train(scene, tmp_path / "run", short, device="cpu").metrics()[-1]
     figures = f"held-out photos {last['psnr_ldr']:.1f} dB, HDR {last['psnr_mu']:.1f} dB (mu-law)"
@@ -67,7 +67,7 @@ def test_held_out_photos_that_a_mask_excludes_have_no_figures(scene, tmp_path, e
     assert bool(run.metrics()) == (len(excluded) == 1), "NaN would be left out by every reader"
 
 
-def test_held_out_photos_that_get_worse_are_told(scene, tmp_path, caplog):
+def test_held_out_photos_that_get_worse_are_named(scene, tmp_path, caplog):
     training = create_trainer(scene, tmp_path / "run", quick(**{"schedule.iterations": 4}), device="cpu")
     training.output.folder.append_metrics({"iteration": 2, "psnr_ldr": 99.0})
     training.train()

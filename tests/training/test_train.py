@@ -39,7 +39,7 @@ def test_every_variant_learns_and_loads_as_it_was_trained(scene, trained, varian
 
 
 @pytest.mark.parametrize("options", [{}, {"mcmc.cap_density": 0.1}, {"densification.cap_max": 50}])
-def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_path, caplog, options):
+def test_more_start_points_than_the_budget_stay_as_many_and_are_logged(scene, tmp_path, caplog, options):
     """60 points; 0.1 times the square root of six photos of 32 x 32 pixels is 7."""
     caplog.set_level("INFO")
     config = quick(**{"schedule.iterations": 40, "mcmc.growth_rate": 0.5, "model.initial_density": 0.0} | options)
@@ -51,7 +51,7 @@ def test_more_start_points_than_the_budget_stay_as_many_and_are_told(scene, tmp_
     assert count == options.get("densification.cap_max", 60) if options else count > 60
 
 
-def test_what_was_repaired_in_a_response_file_is_told(scene, tmp_path, caplog):
+def test_repairs_of_a_response_file_are_logged(scene, tmp_path, caplog):
     caplog.set_level("INFO")
     path = tmp_path / "camera.csv"
     path.write_text("0 0\n0.2 0.5\n0.4 0.7\n0.6 0.6\n1 1\n")

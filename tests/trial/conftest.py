@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.report_tables import trial_table
 from benchmarks.results import markdown_table
-from tests.fuzz.run import keep, kept, told
+from tests.fuzz.run import provenance_of, read_values, store_values
 
 from .harness import COMMANDS, SEED, TRAIN, VIEW, browse, call, load
 
@@ -66,5 +66,7 @@ def pytest_terminal_summary(terminalreporter):
         used = sum(os.times()[:4])  # On a busy machine the seconds of the table say little.
         terminalreporter.write_line(f"{used:.0f} s of processor time, those of pytest and all that it started")
         if path := os.environ.get("SEHDR_TRIAL_JSON"):
-            known = {row["family"]: row for row in kept(Path(path)).get("rows", [])}
-            keep(Path(path), rows=[*(known | rows).values()], seed=SEED, **told("pytest -m trial tests/trial"))
+            known = {row["family"]: row for row in read_values(Path(path)).get("rows", [])}
+            store_values(
+                Path(path), rows=[*(known | rows).values()], seed=SEED, **provenance_of("pytest -m trial tests/trial")
+            )

@@ -53,7 +53,7 @@ CHANGES = ("rename", "replace", "unlink", "rmdir", "mkdir", "fsync", "open", "wr
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command line ended. code: as of subprocess; memory: MiB, at most; changes: calls of CHANGES."""
+    """End of a command line. code: as of subprocess; memory: MiB, at most; changes: calls of CHANGES."""
 
     code: int
     out: str

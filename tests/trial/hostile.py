@@ -1,4 +1,4 @@
-"""What trials of files that are damaged or were made to do harm share: command lines on a folder, and files to spoil.
+"""Command lines on a folder, and files to spoil, for trials of files that are damaged or were made to do harm.
 
 A case says what it expects: a refusal in one line, or, under EITHER, that line or the right result.
 """
@@ -54,7 +54,7 @@ def link(place: str, target: str):
 
 
 class _Sent(HTMLParser):
-    """What of a page was sent and could do something."""
+    """Parts of a page that were sent and could do something."""
 
     def __init__(self, page: str):
         super().__init__()

@@ -1,4 +1,4 @@
-"""What tired people and batch jobs type: values of flags, names of output, environments, ranks."""
+"""Command lines as tired people and batch jobs type them: values of flags, names of output, environments, ranks."""
 
 import os
 from pathlib import Path

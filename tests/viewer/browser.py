@@ -63,7 +63,7 @@ def pinch(page, before, after):
 
 
 def pixels(page, selector):
-    """What a canvas of the page shows: [H, W, 3] in [0, 1], at its own size, once looks rest."""
+    """Return the picture of a canvas, [H, W, 3] in [0, 1] at its own size, once the view has stopped moving."""
     import base64
     import io
 

@@ -157,7 +157,7 @@ def test_floaters_faint_and_unmasked_gaussians_are_left_out(tmp_path):
         assert sum(shown()) == 3
 
 
-def test_masks_that_are_not_there_are_told(server):
+def test_masks_that_are_not_there_are_named(server):
     status, words = edit(server, mask_only=True)
     assert status == 409 and "photos" in words
 

@@ -37,7 +37,7 @@ def rest(page):
 
 
 def light_of(page, run):
-    """What the page shows now, rendered here: exposures at 0 EV [H, W, 3], as display light."""
+    """Render the page's view here: exposures at 0 EV [H, W, 3], as display light."""
     camera = Camera.from_dict(page.evaluate("window.viewer.camera()"))
     return run.render(camera).hdr.numpy() * run.base_time * display_gain(run.response)
 
@@ -238,7 +238,7 @@ def test_moving_resizing_and_two_at_once(chromium, serve):
         np.testing.assert_array_equal(pixels(other, "#picture"), theirs)
 
 
-def test_brackets_and_a_film_are_saved_and_what_is_wrong_is_told(chromium, serve):
+def test_brackets_and_a_film_are_saved_and_errors_are_shown(chromium, serve):
     pytest.importorskip("av")
     with page_of(chromium, serve().url, width=440, height=260) as page:
         page.wait_for_selector(FULL)

@@ -202,7 +202,7 @@ def test_a_taken_port_leads_to_the_next(serve, logged):
     frame(second, camera(33, 21))  # The ports that were tried before did not end what is shown.
 
 
-def test_photos_that_are_gone_are_told(serve):
+def test_photos_that_are_gone_are_named(serve):
     def gone(index):
         raise InputError("photos", "are no longer here", "say where")
 

@@ -9,7 +9,7 @@ from sehdr_warp.output.commands import Render, ViewFileOptions, run_render
 from sehdr_warp.output.export.commands import Convert, Export, run_convert, run_export
 
 
-def test_a_wrong_suffix_is_told_all_that_export_writes(tmp_path):
+def test_a_wrong_suffix_gets_a_line_with_all_that_export_writes(tmp_path):
     with pytest.raises(InputError, match=r"scene: is not a splat file; use one of \.ply .* \.glb .* \.html$"):
         run_export(Export(run=tmp_path, out=tmp_path / "scene"))
     with pytest.raises(InputError, match=r"holds 8 bits .* \.html$"):

@@ -82,7 +82,7 @@ def test_luts_beside_a_config_are_read(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "kind", ["missing", "damaged", "no lut", "cycle", "pipe", "device", "folder", "sparse", "empty", "not text"]
 )
-def test_luts_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
+def test_luts_that_cannot_be_read_are_named_in_a_line(tmp_path, kind):
     lut = tmp_path / "x.cube"
     if kind == "pipe":
         os.mkfifo(lut)
@@ -104,7 +104,7 @@ def test_luts_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["no archive", "large"])
-def test_archives_that_cannot_be_read_are_told_in_a_line(tmp_path, kind):
+def test_archives_that_cannot_be_read_are_named_in_a_line(tmp_path, kind):
     file = tmp_path / "own.ocioz"
     file.write_bytes(b"PK" + bytes(100))
     if kind == "large":

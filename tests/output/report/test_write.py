@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("coarse_figures")
 
 
 def columns_of_pictures(path):
-    """How many pictures stand side by side: runs of columns that are not white from top to bottom, past the margin."""
+    """Count pictures side by side: runs of columns that are not white from top to bottom, past the margin."""
     pixels = np.asarray(Image.open(path).convert("L"))
     middle = pixels[pixels.shape[0] // 4 : pixels.shape[0] // 3, 60:]
     dark = (middle < 250).mean(axis=0) > 0.5

@@ -28,7 +28,7 @@ def modules(cache):
 
 @pytest.mark.parametrize("damage", ["", "half", "wp_blend_0a1b2c3.O"])
 @pytest.mark.parametrize("end", [".o", ".meta"])
-def test_damaged_modules_go_and_are_told_once(cache, caplog, damage, end):
+def test_damaged_modules_go_and_are_logged_once(cache, caplog, damage, end):
     kernel_cache.discard_damaged()
     assert len(modules(cache)) == 3 and not caplog.text
     (cache / "wp_blend_0a1b2c3" / f"wp_blend_0a1b2c3{end}").write_text(damage)

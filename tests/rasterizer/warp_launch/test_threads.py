@@ -24,7 +24,7 @@ def three_threads(monkeypatch):
 
 @pytest.fixture(params=["OpenMP", "helpers"])
 def means(request, monkeypatch):
-    """How threads are had: torch's OpenMP, where it has one, or helpers of our own."""
+    """Select the source of threads: torch's OpenMP, where it has one, or helpers of our own."""
     if request.param == "helpers":
         monkeypatch.setattr(threads, "openmp_parallel", lambda: 0)
     elif not threads.openmp_parallel():
@@ -32,7 +32,7 @@ def means(request, monkeypatch):
 
 
 def squares(count: int, ranges: torch.Tensor | None = None) -> bool:
-    """Whether each of `count` values is squared once."""
+    """Return whether each of `count` values is squared once."""
     values, sums = torch.arange(count).float(), torch.zeros(count)
     launch(add_squares, count, values, sums, ranges=ranges, min_range=1)
     return torch.equal(sums, values * values)

@@ -81,7 +81,7 @@ def test_gains_and_falloff_are_found(gains, points):
 
 
 @pytest.mark.parametrize("cause", ["times", "places"])
-def test_what_follows_stated_times_or_places_is_told_apart(cause):
+def test_gains_that_follow_stated_times_or_places_are_separated(cause):
     """A wrong curve makes gains of the times themselves, what is brighter from one side those of places; what a camera
     rounds is beside them."""
     views = [replace(v, exposure_time=2.0 ** (k % 4)) for k, v in enumerate(photographed({}, {}).train_views)]
@@ -131,7 +131,7 @@ def test_a_falloff_is_not_extrapolated_from_the_middle_of_photos(gains, points):
             np.testing.assert_allclose(fitted.gains[view.name], gains[view.name], rtol=0.06)
 
 
-def test_a_lens_is_told_by_exif_and_by_the_field_of_view(tmp_path):
+def test_a_lens_is_recognized_by_exif_and_by_the_field_of_view(tmp_path):
     def exif_photo(index, model, focal=35, aperture=2.8):
         exif, path = Image.Exif(), tmp_path / f"{index}.jpg"
         exif[272] = model

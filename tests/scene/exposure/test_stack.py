@@ -41,7 +41,7 @@ def write_photos(folder, times, shift=0):
     return folder
 
 
-def test_a_stack_from_one_place_is_told_before_it_is_matched(tmp_path, caplog):
+def test_a_stack_from_one_place_is_named_before_it_is_matched(tmp_path, caplog):
     folder = write_photos(tmp_path / "my stack", (8.0, 0.125, 1.0))
     with pytest.raises(InputError) as caught, caplog.at_level("INFO"):
         load_scene(folder)

@@ -115,7 +115,7 @@ def test_exif_times_count_sensitivity_and_aperture(tmp_path):
     assert "ISO differs (100 to 400)" in text and "exposures differ: 1/400 to 1 s" in text
 
 
-def test_exposures_of_photos_that_are_left_out_are_not_told_of(tmp_path, monkeypatch):
+def test_exposures_of_photos_that_are_left_out_are_not_named(tmp_path, monkeypatch):
     exif = {i: {TIME: 0.01, ISO: 100} for i in range(5)} | {5: {TIME: 1.0, ISO: 400}}
     write_colmap(tmp_path / "model", name="{:03d}.jpg", exif=exif)
     placed = load(tmp_path / "model")

@@ -98,7 +98,7 @@ def test_grey_tiffs_of_16_bits_whose_white_is_0_or_that_hold_12(tmp_path):
     np.testing.assert_allclose(read[..., 1], grey * (65535 / 4095), atol=0.51)
 
 
-def test_planes_without_strips_are_told_by_their_channel(tmp_path):
+def test_planes_without_strips_are_named_by_their_channel(tmp_path):
     tifffile = pytest.importorskip("tifffile")
     options = {"photometric": "rgb", "planarconfig": "separate"}
     tifffile.imwrite(tmp_path / "a.tif", RNG.integers(0, 65536, (3, 12, 16), dtype=np.uint16), byteorder="<", **options)

@@ -255,7 +255,7 @@ def test_a_folder_of_a_set_beside_the_photos_is_named(tmp_path):
     assert find_photos(tmp_path).notes == ("photos in folders of it are not read: nerfstudio_data",)
 
 
-def test_photos_are_found_beside_a_cover_and_told_of_in_folders(tmp_path):
+def test_photos_are_found_beside_a_cover_and_named_in_folders(tmp_path):
     for name in ("day/1.png", "day/2.png", "day/3.png", "text/note.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()

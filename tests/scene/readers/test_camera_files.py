@@ -79,7 +79,7 @@ def test_a_splat_is_no_camera_file(tmp_path):
 
 
 @pytest.mark.parametrize(("suffix", "name"), [(".abc", "Alembic"), (".FBX", "FBX")])
-def test_camera_files_of_other_programs_are_told_what_to_export(tmp_path, suffix, name):
+def test_camera_files_of_other_programs_get_a_line_on_what_to_export(tmp_path, suffix, name):
     path = tmp_path / f"shot{suffix}"
     path.write_bytes(b"Ogawa\xff\x00")
     with pytest.raises(InputError, match=f"shot{suffix}: {name} files are not read; export the camera as OpenUSD"):

@@ -76,11 +76,11 @@ def test_a_killed_process_leaves_no_copies_of_photos_in_the_cache(tmp_path):
 
 def test_a_constant_that_changes_the_result_finds_cameras_anew(key, monkeypatch):
     before, brightening = key(), sfm.BRIGHTENING
-    values = {name: getattr(sfm, name) + 1 for name in CONSTANTS}
-    changes = [
-        *values.items(),
-        *(("BRIGHTENING", (*brightening[:i], 0.1, *brightening[i + 1 :])) for i in range(len(brightening))),
-    ]
+    changes = [(name, getattr(sfm, name) + 1) for name in CONSTANTS]
+    for index in range(len(brightening)):
+        values = list(brightening)
+        values[index] = 0.1
+        changes.append(("BRIGHTENING", tuple(values)))
     for name, value in changes:
         with monkeypatch.context() as patch:
             patch.setattr(sfm, name, value)
@@ -288,7 +288,7 @@ def test_poor_placement_is_named_with_its_photos():
 
 
 @pytest.mark.parametrize("step", [0.0, 8.0])
-def test_photos_from_one_place_are_told(tmp_path, step):
+def test_photos_from_one_place_are_named(tmp_path, step):
     """A camera that stands still is not placed; one that turns is, at places that mean nothing."""
     noise = np.random.default_rng(0).uniform(0, 255, (80, 160)).astype(np.uint8)
     wall = Image.fromarray(noise).resize((1600, 800), Image.Resampling.BICUBIC)
