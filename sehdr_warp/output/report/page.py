@@ -212,7 +212,8 @@ def _lights(lights: Sequence[Light], unit: float | None, transform: WorldTransfo
         "the light at the default place of envmap."
     )
     if len(lights) > _MOST_LIGHTS:
-        lead += f" {len(listed)} of {len(lights)}: the largest shares, and lights that photos walk around."
+        others = ", and lights that photos walk around" * bool(without_share)
+        lead += f" {len(listed)} of {len(lights)}: the largest shares{others}."
     lead = " ".join([lead, *(f"{sentence}." for sentence in uncertain_lights(listed))])
     return _section("Lights", lead, _rows(titles, rows, first_number=4))
 
