@@ -54,6 +54,14 @@ def test_grey_photos_of_a_conference_room_are_photos(tmp_path):
     assert len(dataset.records) == 4 and dataset.notes == ()
 
 
+def test_one_of_two_files_of_the_same_bytes_stays_whatever_their_kinds(tmp_path):
+    """The shorter name is the original of its copy, although its kind of file would be preferred less."""
+    write_photos(tmp_path, ["IMG_0.jpg", "IMG_1.jpg"], (96, 64))
+    shutil.copy(tmp_path / "IMG_0.jpg", tmp_path / "IMG_0.tiff")
+    files = sorted(tmp_path.iterdir())
+    assert find_copies(files) == {tmp_path / "IMG_0.tiff": tmp_path / "IMG_0.jpg"}
+
+
 def test_copies_in_another_kind_of_file_are_left_out_and_named(tmp_path):
     """The kind that may hold more counts, also if a copy is turned; a photo of the same name is no copy."""
     for i in range(5):
