@@ -84,7 +84,7 @@ def received_light(
         place = torch.tensor(field.normalization.points(position), dtype=torch.float32)
         distance = (field.gaussians.means - place.to(field.gaussians.means.device)).norm(dim=1)
         opacities = field.gaussians.opacities() * (distance * field.normalization.unit >= beyond)
-    return _received_by(field, _panorama(position, focal), degree, opacities)
+    return _received_by(field, _panorama(position, focal), degree, opacities, at_place=True)
 
 
 @torch.no_grad()
@@ -264,15 +264,20 @@ def _panorama(position: np.ndarray, focal: float) -> Camera:
 
 
 def _received_by(
-    field: RadianceField, camera: Camera, degree: int | None, opacities: Tensor | None = None
+    field: RadianceField,
+    camera: Camera,
+    degree: int | None,
+    opacities: Tensor | None = None,
+    *,
+    at_place: bool = False,
 ) -> ReceivedLight:
-    """Return what a camera receives of each Gaussian."""
+    """Return what a camera receives of each Gaussian; `at_place` as of weighted_sums()."""
     device = field.gaussians.means.device
     angle = torch.tensor(steradians(camera), dtype=torch.float32, device=device)
     # Sums of small angles stay numbers of about 1.
     unit = float(angle.mean())
     images = torch.stack([torch.ones_like(angle), angle / unit], 2)
-    sums = field.weighted_sums(field.camera_tensors(camera), images, opacities)
+    sums = field.weighted_sums(field.camera_tensors(camera), images, opacities, at_place=at_place)
     radiance = field.radiance_towards(camera.position, degree=degree)
     return ReceivedLight(sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit))
 

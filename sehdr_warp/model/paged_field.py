@@ -18,8 +18,8 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..scene import Camera
 from .gaussians import PARAMETER_NAMES, Gaussians
-from .radiance_field import NO_DATA, RadianceField, require_camera
-from .renders import DirectionalRender, RenderedView
+from .radiance_field import NO_DATA, RadianceField
+from .renders import DirectionalRender, RenderedView, require_camera
 
 CELL = 1 << 16  # Gaussians of a cell
 DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its cell, standard deviations
@@ -119,6 +119,8 @@ class PagedField(RadianceField):
         part = self._part(levels)
         if self.confidence is not None:  # Gathered here alone: other pictures of millions of Gaussians do not need it.
             part.confidence = self._of_rows(self.confidence, levels)
+        if self.filters is not None:
+            part.filters = self._of_rows(self.filters, levels)
         return part.render_directions(position, directions, **options)
 
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:

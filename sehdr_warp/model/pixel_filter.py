@@ -3,6 +3,8 @@
 The rasterizer adds a variance of EPS2D square pixels to each projected Gaussian. In a training these are pixels of the
 photos, and Gaussians are fitted with it. With a longer focal length in pixels, the same variance is less of the scene:
 small Gaussians shrink, and a lamp loses most of its light. With a shorter one it is more, and a lamp gains light.
+The same holds for pictures of all directions from a place that is nearer to a lamp than the photos, or farther: there
+the filter is a part of the scene's sizes.
 """
 
 import math
@@ -23,7 +25,9 @@ from .renders import CameraTensors
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
 TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
 MOST_CAMERAS = 128  # Each takes a few tenths of a second of a million Gaussians.
+PLACE_CAMERAS = 32  # The same for pictures from a place, which are otherwise made within seconds
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
+NO_PIXEL = 1e6  # Pixels: the focal length of cameras whose pixels have next to no size
 NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
 
 
@@ -47,6 +51,62 @@ class FocalRange(NamedTuple):
         """Return the variance of the photos' filter in square pixels of a render with a focal length in pixels."""
         ratio = focal / self.nearest(focal)
         return EPS2D if abs(ratio - 1) < ROUNDING else EPS2D * ratio**2
+
+
+class PlaceOptions(NamedTuple):
+    """Arguments of rasterize_directions() for a picture from any place."""
+
+    log_scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    focal_length: float  # Pixels
+    pixel_angle: float  # Radians
+
+
+def options_at_place(
+    field: Any, place: Tensor, opacities: Tensor, focal_length: float, pixel_angle: float
+) -> PlaceOptions:
+    """Return arguments with which Gaussians are as large, from any place, as the photos show them.
+
+    Those that are smaller than a pixel from there are enlarged to it and keep their light. Unchanged if the photos'
+    filter is not known, or if opacities make up for it.
+
+    Args:
+        field: A RadianceField.
+        place: [3], in the unit of its Gaussians.
+        opacities: [N] of these.
+        focal_length: Of the photos, pixels.
+        pixel_angle: Of the picture's pixels, radians.
+    """
+    gaussians, filters = field.gaussians, field.filters
+    if filters is None:
+        return PlaceOptions(gaussians.log_scales, opacities, focal_length, pixel_angle)
+    offsets = gaussians.means.detach() - place
+    distances = offsets.norm(dim=1).clamp_min(NEAR)
+    turns = torch.cat([gaussians.quaternions[:, :1], -gaussians.quaternions[:, 1:]], dim=1).detach()
+    along = (rotate(turns, offsets) / distances[:, None]).square()
+    squares = (2 * gaussians.log_scales.detach()).exp()
+    # Of the projection to a plane across the line of sight: determinant and trace of its covariance.
+    area = (squares.roll(1, 1) * squares.roll(2, 1) * along).sum(1)
+    spread = (squares * (1 - along)).sum(1)
+    variances = filters.square()
+    wider = variances.maximum(EPS2D * (pixel_angle * distances).square())
+    shown, drawn = (area + each * spread + each.square() for each in (variances, wider))
+    log_scales = (squares + wider[:, None]).log() / 2
+    return PlaceOptions(log_scales, opacities * (shown / drawn).sqrt(), NO_PIXEL, 0.0)
+
+
+def filters_of(field: Any) -> Tensor | None:
+    """Return the filters [N] of a field's Gaussians in their unit, as its file states them or by its photos' cameras.
+
+    None if neither is known, or if opacities make up for the filter.
+    """
+    filters, means = field.photo_filters, field.gaussians.means
+    if field.antialiased:
+        return None
+    if filters is None and field.photo_cameras:
+        places = field.normalization.scene_points(means.detach().double().cpu().numpy())
+        filters = photo_filters(places, every_nth(field.photo_cameras, PLACE_CAMERAS)) / field.normalization.unit
+    return None if filters is None else torch.tensor(filters, dtype=torch.float32, device=means.device).clamp_min(NEAR)
 
 
 def samples_across_pixel(field: Any, camera: Camera) -> int:

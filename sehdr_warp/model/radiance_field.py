@@ -5,7 +5,9 @@ projected, sorted and blended once.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +21,8 @@ from ..scene.normalization import Normalization
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
-from .pixel_filter import EPS2D, FocalRange, keep_light
-from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView
+from .pixel_filter import EPS2D, FocalRange, PlaceOptions, filters_of, keep_light, options_at_place
+from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, require_camera, unpremultiply
 
 NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
 _PIXELS_AT_ONCE = 1 << 19  # Of which colors are decoded
@@ -35,12 +37,14 @@ class RadianceField(nn.Module):
         photo_focals: Focal lengths of the photos, with which renders of another resolution keep the light of small
             Gaussians; None in a training, and if they are not known.
         photo_filters: [N] filters of GaussianArrays, as a file states them; None of a run, whose cameras state them.
+        photo_cameras: Cameras of the photos of a run, scene coordinates.
         rasterizer: rasterize(); benchmarks set a function with the same arguments.
     """
 
     confidence: Tensor | None
     clipped_stops: Tensor | None
     photo_filters: np.ndarray | None = None
+    photo_cameras: Sequence[Camera] = ()
     rasterizer: Callable[..., Rendering] = staticmethod(rasterize)
 
     def __init__(
@@ -87,6 +91,11 @@ class RadianceField(nn.Module):
     def render_device(self) -> torch.device:
         """Device that pictures are rendered on."""
         return self.gaussians.means.device
+
+    @cached_property
+    def filters(self) -> Tensor | None:
+        """The photos' filter at each Gaussian, as of filters_of(); the Gaussians must not move any more."""
+        return filters_of(self)
 
     def camera_tensors(self, camera: Camera) -> CameraTensors:
         """Return a camera of scene coordinates in those of the Gaussians, on their device."""
@@ -182,7 +191,7 @@ class RadianceField(nn.Module):
         colors = self._blended_colors(tensors.position, degree)
         rendering = self._rasterize(tensors, torch.cat([colors, depth, *values], dim=1))
         alpha = rendering.alpha
-        depth, *means = (_unpremultiply(channel, alpha) for channel in rendering.image[..., 3:].unbind(-1))
+        depth, *means = (unpremultiply(channel, alpha) for channel in rendering.image[..., 3:].unbind(-1))
         # In bands, because decoding takes many times the memory of what it decodes.
         image, rows = rendering.image, max(1, _PIXELS_AT_ONCE // camera.width)
         hdr = image.new_empty(*image.shape[:2], 3)
@@ -227,23 +236,21 @@ class RadianceField(nn.Module):
             features.append(self.confidence[:, None])
         if shares is not None:
             features.append(colors.mean(1, keepdim=True) * shares[:, None])
+        place = options_at_place(self, origin, gaussians.opacities(), focal_length, pixel_angle)
+        options: dict[str, Any] = place._asdict() | {"antialiased": self.antialiased}
+        options |= {"near_plane": beyond / self.normalization.unit} if beyond else {}
         image, transmittance = rasterize_directions(
             gaussians.means,
-            gaussians.log_scales,
-            gaussians.quaternions,
-            gaussians.opacities(),
-            torch.cat(features, dim=1),
-            origin,
-            directions,
-            focal_length=focal_length,
-            pixel_angle=pixel_angle,
-            antialiased=self.antialiased,
-            **({"near_plane": beyond / self.normalization.unit} if beyond else {}),
+            quaternions=gaussians.quaternions,
+            features=torch.cat(features, dim=1),
+            position=origin,
+            directions=directions,
+            **options,
         )
         clipped = None if shares is None else image[..., -1] / image[..., :3].mean(2).clamp_min(1e-30)
         image = image if shares is None else image[..., :-1]
         alpha = 1 - transmittance
-        distance, *confidence = (_unpremultiply(image[..., i], alpha) for i in range(3, image.shape[2]))
+        distance, *confidence = (unpremultiply(image[..., i], alpha) for i in range(3, image.shape[2]))
         confidence = confidence[0].clamp(0, 1) if confidence else None
         distance = distance * self.normalization.unit
         hdr = self._to_exposures(image[..., :3]) / self.base_time
@@ -271,7 +278,7 @@ class RadianceField(nn.Module):
         # Three channels like the features of a training, whose kernel is then compiled already.
         features = values[:, None].expand(-1, 3).contiguous()
         rendering = self._rasterize(self.camera_tensors(camera), features)
-        return _unpremultiply(rendering.image[..., 0], rendering.alpha).clamp(0, 1)
+        return unpremultiply(rendering.image[..., 0], rendering.alpha).clamp(0, 1)
 
     @torch.no_grad()
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
@@ -280,14 +287,17 @@ class RadianceField(nn.Module):
         return self._to_exposures(self._blended_colors(place.to(self.gaussians.means.device), degree)) / self.base_time
 
     @without_replays()
-    def weighted_sums(self, camera: CameraTensors, images: Tensor, opacities: Tensor | None = None) -> Tensor:
+    def weighted_sums(
+        self, camera: CameraTensors, images: Tensor, opacities: Tensor | None = None, *, at_place: bool = False
+    ) -> Tensor:
         """Return [N, C]: for each Gaussian the sum over pixels of its blending weight times images [H, W, C].
 
         Blending is linear in the features, so this is the adjoint of a render. `opacities` [N] replace the scene's.
+        `at_place`: a camera of all directions is none of a photo, see options_at_place().
         """
         with torch.enable_grad():
             features = images.new_zeros(self.gaussians.count, images.shape[2]).requires_grad_()
-            blended = self._rasterize(camera, features, opacities=opacities).image
+            blended = self._rasterize(camera, features, opacities=opacities, at_place=at_place).image
             # The gradient of a scalar, because checking explicit gradients loads torch's compiler, two seconds.
             return torch.autograd.grad((blended * images).sum(), features)[0]
 
@@ -321,6 +331,7 @@ class RadianceField(nn.Module):
         features: Tensor,
         max_intersections: int | None = None,
         opacities: Tensor | None = None,
+        at_place: bool = False,
     ) -> Rendering:
         """Rasterize features [N, C].
 
@@ -333,7 +344,7 @@ class RadianceField(nn.Module):
             shapes = means.detach(), log_scales.detach(), quaternions.detach()
             opacities = gaussians.opacities().detach()
         if camera.directions is not None:
-            return self._rasterize_wide(camera, camera.directions, shapes, features, opacities)
+            return self._rasterize_wide(camera, camera.directions, shapes, features, opacities, at_place)
         variance = EPS2D
         if self.photo_focals is not None and not self.antialiased:  # Which keeps the light at every resolution.
             variance = self.photo_focals.variance(float(camera.intrinsics[0]))
@@ -360,32 +371,26 @@ class RadianceField(nn.Module):
         shapes: tuple[Tensor, Tensor, Tensor],
         features: Tensor,
         opacities: Tensor,
+        at_place: bool,
     ) -> Rendering:
         """Rasterize features along a wide camera's directions; the result has no projected means.
 
         shapes: means, log_scales and quaternions.
         """
         focal = float(camera.intrinsics[0])
+        means, log_scales, quaternions = shapes
+        photos = focal if self.photo_focals is None else self.photo_focals.nearest(focal)
+        options = PlaceOptions(log_scales, opacities, photos, 1 / focal)
+        if at_place:
+            options = options_at_place(self, camera.position, opacities, photos, 1 / focal)
         image, transmittance = rasterize_directions(
-            *shapes,
-            opacities,
-            features,
-            camera.position,
-            directions,
-            focal_length=focal if self.photo_focals is None else self.photo_focals.nearest(focal),
-            pixel_angle=1 / focal,
+            means,
+            quaternions=quaternions,
+            features=features,
+            position=camera.position,
+            directions=directions,
             antialiased=self.antialiased,
+            **options._asdict(),
         )
         none = features.new_zeros(len(features), 2)
         return Rendering(image, transmittance, none, none[:, 0], none, 0)
-
-
-def require_camera(camera: object) -> None:
-    """Raise TypeError for what is not a Camera, such as an entry of run.cameras."""
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera is a {type(camera).__name__}, expected a Camera, as run.cameras[0].camera is one")
-
-
-def _unpremultiply(blended: Tensor, alpha: Tensor) -> Tensor:
-    """Return blended / alpha if alpha is above 0.001, else 0; [H, W] each."""
-    return (blended / alpha.clamp_min(1e-3)).masked_fill_(~(alpha > 1e-3), 0)

@@ -107,3 +107,14 @@ class CameraTensors:
             along = np.where(unseen, camera.world_to_camera[2, :3], along)
             directions = torch.tensor(along, dtype=torch.float32, device=device)
         return CameraTensors(camera.width, camera.height, *tensors, directions)  # pyright: ignore[reportCallIssue]
+
+
+def require_camera(camera: object) -> None:
+    """Raise TypeError for what is not a Camera, such as an entry of run.cameras."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera is a {type(camera).__name__}, expected a Camera, as run.cameras[0].camera is one")
+
+
+def unpremultiply(blended: Tensor, alpha: Tensor) -> Tensor:
+    """Return blended / alpha if alpha is above 0.001, else 0; [H, W] each."""
+    return (blended / alpha.clamp_min(1e-3)).masked_fill_(~(alpha > 1e-3), 0)

@@ -240,7 +240,8 @@ class Run(RenderableScene):
         self.response: Response = field.response
         self.base_time = field.base_time
         self.cameras: tuple[CameraEntry, ...] = folder.read_cameras()
-        field.photo_focals = FocalRange.of(entry.camera for entry in self.cameras if entry.split == "train")
+        field.photo_cameras = [entry.camera for entry in self.cameras if entry.split == "train"]
+        field.photo_focals = FocalRange.of(field.photo_cameras)
         self.iterations: int = values["iteration"]
         self.degree = config.continued_after(folder.finished_at()).degree_at(self.iterations)
         self.train_seconds: float = values["seconds"]

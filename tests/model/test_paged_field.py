@@ -77,9 +77,16 @@ def test_directions_are_those_of_the_whole(street):
     rays = torch.nn.functional.normalize(torch.randn(4, 6, 3, generator=torch.Generator().manual_seed(0)), dim=2)
     options = {"focal_length": 10.0, "pixel_angle": 0.1, "shares": torch.linspace(0, 1, 4000)}
     place = np.array([20.0, 0, 1])
-    whole, part = (field.render_directions(place, rays, **options) for field in (street, paged))
-    for name in ("hdr", "alpha", "distance", "confidence", "clipped"):
-        torch.testing.assert_close(getattr(whole, name), getattr(part, name))
+    pictures = []
+    for filters in (None, np.linspace(0.01, 0.5, 4000)):
+        street.photo_filters = paged.photo_filters = filters
+        for field in (street, paged):
+            vars(field).pop("filters", None)
+        whole, part = (field.render_directions(place, rays, **options) for field in (street, paged))
+        for name in ("hdr", "alpha", "distance", "confidence", "clipped"):
+            torch.testing.assert_close(getattr(whole, name), getattr(part, name))
+        pictures.append(whole.hdr)
+    assert not torch.allclose(*pictures)
 
 
 def test_confidence_that_is_measured_between_two_pictures_is_in_the_second(street):

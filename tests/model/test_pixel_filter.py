@@ -10,9 +10,11 @@ import torch
 from sehdr_warp import Camera, load_run
 from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
+from sehdr_warp.model.lights import received_light
 from sehdr_warp.model.pixel_filter import FocalRange, keep_light, photo_filters, samples_across_pixel
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.model.renders import CameraTensors
+from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
 from sehdr_warp.rasterizer.reference import project_reference
 from sehdr_warp.response import response_by_name
 
@@ -34,6 +36,41 @@ def lamps(focals=FOCALS, **options):
 
 def mean_light(field, camera, scale):
     return float(field.render(camera.resized(round(48 * scale), round(36 * scale))).hdr.mean())
+
+
+def lamp(cameras, **options):
+    """One of these lamps, two units in front of the photo."""
+    field = lamps(**options)
+    means, logits = torch.tensor([[0.0, 0.0, 2.0]]).expand(3, 3), torch.tensor([0.4, -20.0, -20.0])
+    field.gaussians.overwrite({"means": means, "opacity_logits": logits})
+    field.photo_cameras = cameras
+    return field
+
+
+def received_on_map(field, place, rows=512):
+    """Light that a map of a place has, in pixels as fine as the photo's or finer."""
+    directions = torch.tensor(latlong(2 * rows), dtype=torch.float32)
+    light = field.render_directions(place, directions, focal_length=PHOTO.fx, pixel_angle=np.pi / rows).hdr.mean(2)
+    return float((light.numpy() * solid_angles(2 * rows, "latlong")).sum() * (np.pi / rows) ** 2)
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0, 4.0])
+def test_a_place_nearer_to_a_lamp_than_the_photos_receives_more_of_its_light(distance):
+    place, photo = np.array([0.0, 0.0, 2.0 - distance]), np.zeros(3)
+    field, without = lamp([PHOTO]), lamp([])
+    as_in_photo = received_on_map(without, photo)
+    assert received_on_map(field, photo) == pytest.approx(as_in_photo, rel=0.03)
+    expected = as_in_photo * (2 / distance) ** 2
+    assert received_on_map(field, place) == pytest.approx(expected, rel=0.05)
+    assert received_light(field, place, PHOTO.fx).light.mean(1).sum() == pytest.approx(expected, rel=0.1)
+    assert not 0.7 < received_on_map(without, place) / expected < 1.4, "what happens without"
+
+
+def test_a_place_needs_no_filter_where_opacities_make_up_for_it():
+    assert lamp([PHOTO], antialiased=True).filters is None and lamp([]).filters is None
+    stated = lamp([PHOTO])
+    stated.photo_filters = np.full(3, 0.25, np.float32)  # As a file states them
+    assert torch.equal(stated.filters, torch.full((3,), 0.25))
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0, 4.0])
