@@ -276,9 +276,12 @@ class RadianceField(nn.Module):
     def render_mean(self, camera: Camera, values: Tensor) -> Tensor:
         """Render the mean [H, W] in [0, 1] of values [N] of the Gaussians, 0 if alpha is at most 0.001."""
         # Three channels like the features of a training, whose kernel is then compiled already.
-        features = values[:, None].expand(-1, 3).contiguous()
-        rendering = self._rasterize(self.camera_tensors(camera), features)
-        return unpremultiply(rendering.image[..., 0], rendering.alpha).clamp(0, 1)
+        return self.render_values(camera, values[:, None].expand(-1, 3).contiguous())[..., 0].clamp(0, 1)
+
+    def render_values(self, camera: Camera, values: Tensor) -> Tensor:
+        """Render the mean [H, W, 3] of values [N, 3] of the Gaussians, 0 if alpha is at most 0.001."""
+        rendering = self._rasterize(self.camera_tensors(camera), values)
+        return unpremultiply(rendering.image, rendering.alpha[..., None])
 
     @torch.no_grad()
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:

@@ -116,5 +116,5 @@ def require_camera(camera: object) -> None:
 
 
 def unpremultiply(blended: Tensor, alpha: Tensor) -> Tensor:
-    """Return blended / alpha if alpha is above 0.001, else 0; [H, W] each."""
+    """Return blended / alpha if alpha is above 0.001, else 0; [H, W] each, or [H, W, C] and [H, W, 1]."""
     return (blended / alpha.clamp_min(1e-3)).masked_fill_(~(alpha > 1e-3), 0)

@@ -43,6 +43,7 @@ class DataManager:
         """Prepare the views of a field's normalized scene; steps are captured if use_cuda_graph."""
         self._scene_views, self._field, self._config, self._use_cuda_graph = views, field, config, use_cuda_graph
         self._uses_intervals = False
+        self.has_measured = False  # Whether estimates were replaced, so that a checkpoint has to hold them
 
     @cached_property
     def light_estimates(self) -> list[ClippedLight] | None:
@@ -64,6 +65,23 @@ class DataManager:
         if iteration > INTERVALS_FROM * self._config.schedule.iterations and not self._uses_intervals:
             self._uses_intervals = True
             self._dataset.scale.use_intervals()
+
+    def replace_estimates(self, estimates: Sequence[Tensor]) -> None:
+        """Replace the estimates [h, w, 6] of all views, also in those that are on the device already."""
+        views, self.has_measured = self.views, True
+        for index, estimate in enumerate(estimates):
+            assert self._dataset.estimates is not None
+            self._dataset.estimates[index] = estimate.cpu()
+            if isinstance(views, ViewStack):
+                assert views.targets.estimates is not None
+                views.targets.estimates[index].copy_(estimate)
+            elif isinstance(views, list):
+                views[index] = replace(views[index], target=replace(views[index].target, estimates=estimate))
+
+    @property
+    def estimates(self) -> list[Tensor] | None:
+        """Estimates [h, w, 6] of each view's log light as the steps take them; None if they take none."""
+        return self._dataset.estimates
 
     @cached_property
     def views(self) -> "DeviceViews":

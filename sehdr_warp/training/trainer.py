@@ -37,6 +37,7 @@ from .data_manager import DataManager, PhotoSampler
 from .gradient_step import OVERFLOWED, SKIPPED, GradientStep, StepOptions, StepResult
 from .initialization import depth_of_points, make_matcher
 from .matching import Matcher
+from .measured_light import replace_measured
 from .moving_average import MovingAverage
 from .optimizer import make_optimizer, means_rate, set_means_rate
 from .process_settings import interruptible, torch_settings
@@ -200,11 +201,10 @@ class Trainer:
 
     def _estimate_seconds_left(self, step_seconds: float) -> float | None:
         """Return the estimated time to the end after a step; None after the first, because that compiles kernels."""
-        steps_before = self.iteration - self.first_iteration - self.step_batch
-        if steps_before == 0:
+        if (steps_before := self.iteration - self.first_iteration - self.step_batch) == 0:
             return None
-        per_iteration = step_seconds / self.step_batch
-        self._seconds_per_iteration += (per_iteration - self._seconds_per_iteration) / min(steps_before, 100)
+        change = step_seconds / self.step_batch - self._seconds_per_iteration
+        self._seconds_per_iteration += change / min(steps_before, 100)
         # With the largest number of Gaussians, a step takes about twice as long as at the start.
         growing = self.field.gaussians.count < self.strategy.cap_max
         growth = max(0.0, 1 - self.iteration / self.strategy.schedule.stop) if growing else 0.0
@@ -235,14 +235,14 @@ class Trainer:
         self.step_batch = min(self.batch, max(1, self.total - self.iteration))
         self.iteration += self.step_batch
         self.data_manager.update_targets(self.iteration)
+        replace_measured(self)
         self._view_index = self.sampler.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
         # The penalties on opacities and sizes end with the refinements.
         refines, loss = not self.strategy.schedule.is_over(self.iteration), self.config.loss
         opacity_weight, size_weight = (loss.opacity_weight, loss.size_weight) if refines else (0.0, 0.0)
-        needs_gradients = self.strategy.needs_gradients(self.iteration)
-        options = StepOptions(self.degree, opacity_weight, size_weight, needs_gradients)
+        options = StepOptions(self.degree, opacity_weight, size_weight, self.strategy.needs_gradients(self.iteration))
 
         # Forward, loss, backward, optimizer step: GradientStep.run().
         views, next_index = self.data_manager.views, self.sampler.peek()

@@ -26,6 +26,8 @@ def state_of(trainer: Trainer) -> Checkpoint:
         "densification": trainer.strategy.state_dict(field.gaussians.count),
         "average": trainer.average.means,
     }
+    if trainer.data_manager.has_measured:
+        parts["estimates"] = {f"{i:06d}": each for i, each in enumerate(trainer.data_manager.estimates or [])}
     order, remaining = trainer.sampler.state()
     parts["generators"] = {"order": order, "device": trainer.generator.get_state()}
     tensors = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
@@ -56,6 +58,8 @@ def load_state(trainer: Trainer, state: Checkpoint) -> None:
     trainer.sampler.load_state(generators["order"], values["order"])
     if trainer.generator.get_state().numel() == generators["device"].numel():
         trainer.generator.set_state(generators["device"].cpu())
+    if estimates := part_of(tensors, "estimates."):
+        trainer.data_manager.replace_estimates([estimates[name] for name in sorted(estimates)])
     trainer.iteration = trainer.first_iteration = values["iteration"]
     trainer.seconds = values["seconds"]
     trainer.gradient_step.step_counters[SKIPPED] = values["skipped_steps"]
