@@ -24,8 +24,8 @@ from .renders import CameraTensors
 
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
 TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
-MOST_CAMERAS = 128  # Each takes a few tenths of a second of a million Gaussians.
-PLACE_CAMERAS = 32  # The same for pictures from a place, which are otherwise made within seconds
+MOST_CAMERAS = 128  # Each takes about a tenth of a second for a million Gaussians.
+PLACE_CAMERAS = 32  # The same for pictures from a place, which otherwise take seconds
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
 NO_PIXEL = 1e6  # Pixels: the focal length of cameras whose pixels have next to no size
 NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
@@ -92,7 +92,8 @@ def options_at_place(
     wider = variances.maximum(EPS2D * (pixel_angle * distances).square())
     shown, drawn = (area + each * spread + each.square() for each in (variances, wider))
     log_scales = (squares + wider[:, None]).log() / 2
-    return PlaceOptions(log_scales, opacities * (shown / drawn).sqrt(), NO_PIXEL, 0.0)
+    shares = (shown / drawn).nan_to_num(1.0)  # Of those so large that a square of their area overflows
+    return PlaceOptions(log_scales, opacities * shares.sqrt(), NO_PIXEL, 0.0)
 
 
 def filters_of(field: Any) -> Tensor | None:

@@ -66,6 +66,15 @@ def test_a_place_nearer_to_a_lamp_than_the_photos_receives_more_of_its_light(dis
     assert not 0.7 < received_on_map(without, place) / expected < 1.4, "what happens without"
 
 
+def test_a_map_has_gaussians_whose_squared_areas_overflow():
+    light = []
+    for cameras in ([PHOTO], []):
+        field = lamp(cameras)
+        field.gaussians.overwrite({"log_scales": torch.full((3, 3), math.log(1e13))})
+        light.append(received_on_map(field, np.zeros(3), rows=32))
+    assert light[0] == pytest.approx(light[1]) and light[0] > 1000
+
+
 def test_a_place_needs_no_filter_where_opacities_make_up_for_it():
     assert lamp([PHOTO], antialiased=True).filters is None and lamp([]).filters is None
     stated = lamp([PHOTO])
