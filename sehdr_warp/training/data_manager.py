@@ -76,7 +76,10 @@ class DataManager:
                 assert views.targets.estimates is not None
                 views.targets.estimates[index].copy_(estimate)
             elif isinstance(views, list):
-                views[index] = replace(views[index], target=replace(views[index].target, estimates=estimate))
+                on_device = estimate.to(self._dataset.device)
+                views[index] = replace(views[index], target=replace(views[index].target, estimates=on_device))
+        if isinstance(views, PhotoStream):
+            views.forget()
 
     @property
     def estimates(self) -> list[Tensor] | None:
@@ -229,6 +232,10 @@ class PhotoStream:
             self._free[self._current].record(torch.cuda.current_stream(self._device))
         if next_index is not None:
             self._fetch(next_index)
+
+    def forget(self) -> None:
+        """Read the next views again, because their estimates were replaced."""
+        self._slot_views = [None] * SLOTS
 
     def _fetch(self, index: int) -> None:
         """Start to fill a slot with a view unless one holds it."""

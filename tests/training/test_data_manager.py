@@ -152,6 +152,35 @@ def test_what_is_brought_is_the_view(device, truth):
             assert torch.equal(streamed.target.exposure_truth, whole.target.exposure_truth)
 
 
+def with_estimates(value, count):
+    return [torch.full((8, 8, 6), value).half() for _ in range(count)]
+
+
+def test_estimates_that_are_replaced_reach_views_on_another_device(scene):
+    manager = make_trainer(scene, load_config("default", {"response.name": "srgb"})).data_manager
+    count = len(scene.train_views)
+    manager._dataset.estimates = with_estimates(1.0, count)
+    manager._dataset.device = torch.device("meta")
+    manager.views = list(manager._dataset)
+    manager.replace_estimates(with_estimates(2.0, count))
+    assert all(view.target.estimates.device.type == "meta" for view in manager.views)
+    assert all(bool((each == 2).all()) for each in manager.estimates)
+
+
+def test_views_in_the_slots_of_a_stream_get_estimates_that_are_replaced(scene, device):
+    manager = make_trainer(scene, load_config("default", {"response.name": "srgb"})).data_manager
+    count = len(scene.train_views)
+    manager._dataset.estimates = with_estimates(1.0, count)
+    manager.views = PhotoStream(manager._dataset)
+    for value in (1.0, 2.0):
+        if value == 2:
+            manager.replace_estimates(with_estimates(value, count))
+        for index, following in ((0, 1), (1, 2), (2, None)):
+            manager.views.stage(index)
+            assert bool((manager.views.at(torch.tensor([index], device=device)).target.estimates == value).all())
+            manager.views.release(following)
+
+
 @pytest.mark.parametrize("change", [lambda scene: scene, unlike_photos])
 def test_steps_without_a_graph_read_the_same_from_a_stack_and_a_stream(scene, device, change):
     source = ViewDataset(change(scene).train_views, EXPOSURE_TIME, device, truth=True)
