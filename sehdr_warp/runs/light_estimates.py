@@ -68,18 +68,18 @@ def light_estimates(
         file_light = None if file_light is None else torch.from_numpy(file_light).to(device).float()
         deviation = view.light_above_white_deviation
         light = combined_estimates(exposure, mask.to(device), view_prior, file_light, deviation)
-        result.append(ClippedLight(_by_solid_angle(light.log_light.cpu(), view.camera), light.certainty.cpu()))
+        result.append(ClippedLight(by_solid_angle(light.log_light.cpu(), view.camera), light.certainty.cpu()))
     return result
 
 
-def _by_solid_angle(estimates: Tensor, camera: Camera) -> Tensor:
+def by_solid_angle(estimates: Tensor, camera: Camera) -> Tensor:
     """Return estimates [h, w, 6] whose squared weights are multiplied by the solid angles of the camera's pixels."""
     if camera.is_pinhole:
         return estimates
     angles = torch.from_numpy(solid_angles(camera))
     weights = F.interpolate(angles[None, None], size=estimates.shape[:2], mode="area")[0, 0, :, :, None]
     weights = (weights / angles.mean().clamp_min(1e-6)).sqrt()
-    return torch.cat([estimates[..., :3], (estimates[..., 3:] * weights).half()], 2)
+    return torch.cat([estimates[..., :3], (estimates[..., 3:] * weights).to(estimates)], 2)
 
 
 @dataclass(frozen=True)

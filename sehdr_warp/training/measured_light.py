@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..model.radiance_field import RadianceField
+from ..runs.light_estimates import by_solid_angle
 from ..scene import View
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 UPDATES = 0.25, 0.5, 0.75  # Parts of a training after which the scene says which pixels show what darker photos measure
 DARKER = 0.5  # Part of the longest exposure up to which a photo measures light
+LEAST_CODE = 3  # From which a photo measures light: half a code is at most a sixth of it
 LEAST_PIXELS, LEAST_PART = 0.05, 0.25
 """Pixels of blending weight in darker photos from which they measure a Gaussian, and the part of its weight in a mean
 photo of the others that a mean darker photo must have."""
@@ -69,28 +71,30 @@ def measured_estimates(
 def _measured_radiance(
     field: RadianceField, views: Sequence[View], darker: Sequence[bool], degree: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the radiance [N, 3] that darker views measure, and whether [N] they do."""
+    """Return the radiance [N, 3] that darker views measure, and whether [N, 3] they do; the mask's weights count."""
     device, count = field.gaussians.means.device, field.gaussians.count
-    light, shown, others, every = (torch.zeros(count, size, device=device) for size in (3, 1, 1, 1))
+    light, shown, others, every = (torch.zeros(count, size, device=device) for size in (3, 3, 1, 1))
     for view, dark in zip(views, darker, strict=True):
         camera = field.camera_tensors(view.camera)
         counts = torch.ones(*view.codes.shape[:2], 1, device=device)
+        if view.mask is not None:
+            counts = counts * torch.tensor(view.mask, device=device)[..., None]
         if not dark:
             others += field.weighted_sums(camera, counts)
             continue
-        unclipped = torch.tensor((view.codes < view.levels).all(2), device=device)[..., None]
-        unclipped = unclipped if view.mask is None else unclipped * torch.tensor(view.mask, device=device)[..., None]
+        unclipped = (view.codes < view.levels).all(2, keepdims=True) & (view.codes >= LEAST_CODE)
+        unclipped = counts * torch.tensor(unclipped, device=device)
         photo = field.response.decode(torch.tensor(view.image, device=device)) / view.exposure_time
         scene = field.render(view.camera, degree=degree).hdr.to(device)
         ratio = (photo / scene.clamp_min(1e-12)).clamp(1 / LARGEST_RATIO, LARGEST_RATIO)
         images = torch.cat([unclipped * ratio, unclipped, counts], 2).float()
         sums = field.weighted_sums(camera, images)
         light += field.radiance_towards(view.camera.position, degree=degree) * sums[:, :3]
-        shown += sums[:, 3:4]
-        every += sums[:, 4:]
+        shown += sums[:, 3:6]
+        every += sums[:, 6:]
     usual = others * (sum(darker) / (len(darker) - sum(darker)))
     measured = (shown > LEAST_PIXELS) & (shown > every / 2) & (shown > LEAST_PART * usual)
-    return light / shown.clamp_min(1e-12), measured[:, 0]
+    return light / shown.clamp_min(1e-12), measured
 
 
 def _replaced(
@@ -98,13 +102,14 @@ def _replaced(
 ) -> Tensor:
     """Return the estimates [h, w, 6] of a view, replaced where most of its light is of measured Gaussians."""
     own = field.radiance_towards(view.camera.position, degree=degree)
-    known = torch.where(measured[:, None], radiance, 0)
-    whole = field.render_values(view.camera, torch.where(measured[:, None], radiance, own))
+    known = torch.where(measured, radiance, 0)
+    whole = field.render_values(view.camera, torch.where(measured, radiance, own))
     is_known = field.render_values(view.camera, known) > LEAST_SHARE * whole
     clipped = torch.tensor(view.codes >= view.levels, device=whole.device)
     logarithm = (whole * (view.exposure_time / field.response.white)).clamp_min(1).log()
     parts = torch.cat([clipped, clipped & is_known, (clipped & is_known) * logarithm], 2).permute(2, 0, 1)[None]
     cells = F.interpolate(parts.float(), size=estimate.shape[:2], mode="area")[0].permute(1, 2, 0).to(estimate.device)
     white, some, total = cells.split(3, dim=2)
-    replaced = torch.cat([total / some.clamp_min(1e-6), torch.full_like(total, 1 / DEVIATION)], 2).to(estimate)
+    replaced = torch.cat([total / some.clamp_min(1e-6), torch.full_like(total, 1 / DEVIATION)], 2)
+    replaced = by_solid_angle(replaced.cpu(), view.camera).to(estimate)
     return torch.where(((some > white / 2) & (white > 0)).repeat(1, 1, 2), replaced, estimate)

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from sehdr_warp.runs.field import field_from_checkpoint
-from sehdr_warp.scene import View, codes_of
+from sehdr_warp.scene import Camera, View, codes_of
+from sehdr_warp.scene.wide_camera import solid_angles
 from sehdr_warp.training.measured_light import DEVIATION, are_measured, measured_estimates
 from sehdr_warp.training.trainer import Trainer
 from sehdr_warp.training.training_state import load_state, state_of
@@ -50,6 +51,36 @@ def test_estimates_are_replaced_where_a_darker_photo_measures_the_light():
         assert is_new.float().mean() > 0.9
         assert result[left][is_new][:, 0].median() == pytest.approx(math.log(24), abs=0.1)
         assert torch.equal(result[~white], estimates[0][~white])
+
+
+def test_a_photo_so_dark_that_the_light_has_no_code_does_not_measure_it():
+    places = panel(0.5, 0.5)
+    shots = photos(field(places, (4.0,) * 3, 0.03), (1, 1, 2.0**-15, 1, 1, 1), (0,) * 6)
+    assert shots[2].codes.max() == 0
+    estimates = [torch.tensor([ESTIMATE] * 3 + [1.0] * 3).half().expand(48, 64, 6) for _ in shots]
+    results = measured_estimates(field(places, (8.0,) * 3, 0.03), shots, estimates, 0)
+    assert all(torch.equal(*pair) for pair in zip(results, estimates, strict=True))
+
+
+def test_a_dark_panorama_measures_a_light_overhead():
+    """Its pixels there count by their solid angle, which the masks of panoramas hold, in every comparison."""
+    places = panel(0.9, 0.9, 0.05, at=(0, 0.3, -4))[:, [0, 2, 1]]
+    truth, scene = field(places, (24.0,) * 3, 0.06), field(places, (8.0,) * 3, 0.06)
+    shots = []
+    for x, time in ((-0.3, 1), (0.0, 1), (0.3, 1 / 32)):
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        camera = Camera(128, 64, 64 / np.pi, 64 / np.pi, 64, 32, pose, "equirectangular")
+        codes = codes_of(truth.response.encode(truth.render(camera).hdr * time).clamp(0, 1).numpy(), 8)
+        shots.append(View(f"v{len(shots)}", codes, camera, time, "train", mask=solid_angles(camera)))
+    estimates = [torch.tensor([ESTIMATE] * 3 + [1.0] * 3).half().expand(64, 128, 6) for _ in shots]
+    result = measured_estimates(scene, shots, estimates, 0)[0]
+    is_new = result[..., 0] != ESTIMATE
+    assert is_new.sum() > 0.6 * (shots[0].codes == 255).all(2).sum() > 200
+    assert result[is_new][:, 0].median() == pytest.approx(math.log(24), abs=0.2)
+    angles = solid_angles(shots[0].camera)
+    expected = torch.from_numpy(np.sqrt(angles / angles.mean()))[is_new] / DEVIATION
+    torch.testing.assert_close(result[is_new][:, 3].float(), expected, rtol=2e-3, atol=0)
 
 
 def test_a_training_continues_with_the_estimates_that_it_replaced():
