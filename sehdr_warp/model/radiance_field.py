@@ -296,7 +296,7 @@ class RadianceField(nn.Module):
         """Return [N, C]: for each Gaussian the sum over pixels of its blending weight times images [H, W, C].
 
         Blending is linear in the features, so this is the adjoint of a render. `opacities` [N] replace the scene's.
-        `at_place`: a camera of all directions is none of a photo, see options_at_place().
+        `at_place`: a camera of all directions is not one of a photo but at any place, see options_at_place().
         """
         with torch.enable_grad():
             features = images.new_zeros(self.gaussians.count, images.shape[2]).requires_grad_()

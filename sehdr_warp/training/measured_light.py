@@ -37,7 +37,7 @@ def are_measured(views: Sequence[View]) -> bool:
 
 
 def replace_measured(trainer: "Trainer") -> None:
-    """Replace estimates of clipped light that darker photos measure, if an iteration of this step is due for it."""
+    """Replace estimates of clipped light that darker photos measure, in the step that comes to a part of UPDATES."""
     views, estimates, total = trainer.scene.train_views, trainer.data_manager.estimates, trainer.total
     before = trainer.iteration - trainer.step_batch
     due = any(before < part * total <= trainer.iteration for part in UPDATES)
@@ -71,7 +71,7 @@ def measured_estimates(
 def _measured_radiance(
     field: RadianceField, views: Sequence[View], darker: Sequence[bool], degree: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the radiance [N, 3] that darker views measure, and whether [N, 3] they do; the mask's weights count."""
+    """Return the radiance [N, 3] that darker views measure, and whether [N, 3] they do. Pixels count by their masks."""
     device, count = field.gaussians.means.device, field.gaussians.count
     light, shown, others, every = (torch.zeros(count, size, device=device) for size in (3, 3, 1, 1))
     for view, dark in zip(views, darker, strict=True):

@@ -6,12 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.linalg import null_space
+from scipy.spatial.transform import Rotation
 
 from sehdr_warp import Camera, load_run
 from sehdr_warp.kernels.constants import EPS2D
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.lights import received_light
-from sehdr_warp.model.pixel_filter import FocalRange, keep_light, photo_filters, samples_across_pixel
+from sehdr_warp.model.pixel_filter import (
+    FocalRange,
+    keep_light,
+    options_at_place,
+    photo_filters,
+    samples_across_pixel,
+)
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
@@ -64,6 +72,32 @@ def test_a_place_nearer_to_a_lamp_than_the_photos_receives_more_of_its_light(dis
     assert received_on_map(field, place) == pytest.approx(expected, rel=0.05)
     assert received_light(field, place, PHOTO.fx).light.mean(1).sum() == pytest.approx(expected, rel=0.1)
     assert not 0.7 < received_on_map(without, place) / expected < 1.4, "what happens without"
+
+
+@pytest.mark.parametrize("pixel_angle", [1e-4, 0.2])
+def test_turned_flat_gaussians_keep_their_light_in_pixels_of_any_size(pixel_angle):
+    """Opacity times the area across the line of sight, in float64, is that of sizes with the photos' filter."""
+    field, place = lamps(), np.array([0.7, -0.4, 1.0])
+    turns = Rotation.random(3, random_state=0)
+    scales = np.array([[0.001, 0.01, 0.05], [0.02, 0.002, 0.002], [0.3, 0.1, 0.01]])
+    quaternions = 3 * np.roll(turns.as_quat(), 1, axis=1)  # Of any length
+    field.gaussians.overwrite({"log_scales": torch.tensor(scales).log(), "quaternions": torch.tensor(quaternions)})
+    field.photo_cameras = [PHOTO]
+    opacities = field.gaussians.opacities().detach()
+    options = options_at_place(field, torch.tensor(place, dtype=torch.float32), opacities, PHOTO.fx, pixel_angle)
+
+    def areas(variances):
+        covariances = turns.as_matrix() * variances[:, None] @ turns.as_matrix().transpose(0, 2, 1)
+        sights = field.gaussians.means.detach().numpy() - place
+        sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+        across = [null_space(sight[None]) for sight in sights]
+        return [np.sqrt(np.linalg.det(a.T @ each @ a)) for a, each in zip(across, covariances, strict=True)]
+
+    expected = opacities.numpy() * areas(scales**2 + field.filters.numpy()[:, None] ** 2)
+    light = options.opacities.numpy() * areas(np.exp(2 * options.log_scales.double().numpy()))
+    np.testing.assert_allclose(light, expected, rtol=1e-5)
+    if pixel_angle < 0.1:
+        assert torch.equal(options.opacities, opacities)
 
 
 def test_a_map_has_gaussians_whose_squared_areas_overflow():
