@@ -27,6 +27,7 @@ TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no fi
 MOST_CAMERAS = 128  # Each takes about a tenth of a second for a million Gaussians.
 PLACE_CAMERAS = 32  # The same for pictures from a place, which otherwise take seconds
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
+ROWS = 1 << 17  # Gaussians that are projected at once: each takes 140 bytes meanwhile.
 NO_PIXEL = 1e6  # Pixels: the focal length of cameras whose pixels have next to no size
 NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
 
@@ -138,6 +139,9 @@ def photo_filters(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """
     from scipy.spatial import KDTree
 
+    if len(means) > ROWS:
+        parts = np.split(means, range(ROWS, len(means), ROWS))
+        return np.concatenate([photo_filters(part, cameras) for part in parts])
     angles = np.array([1 / math.sqrt(camera.fx * camera.fy) for camera in cameras])
     nearest, index = KDTree(np.stack([camera.position for camera in cameras])).query(means)
     count, logarithms = np.zeros(len(means)), np.zeros(len(means))

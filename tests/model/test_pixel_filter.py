@@ -1,6 +1,7 @@
 """Renders of another resolution than the photos give the same light."""
 
 import math
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -176,6 +177,19 @@ def test_fisheye_photos_have_no_part_in_filters_of_what_is_behind_them(distortio
     ahead = replace(FISHEYE, projection="RADIAL_FISHEYE", distortion=distortion, world_to_camera=pose_at(2.0))
     behind = replace(ahead, world_to_camera=pose_at(-8.0))
     np.testing.assert_allclose(photo_filters(place, [ahead, behind]), 2 * pixel)
+
+
+def test_filters_of_many_gaussians_take_little_memory():
+    means = np.random.default_rng(0).uniform(-1, 1, (400_000, 3)) + np.array([0, 0, 2])
+    cameras = [PHOTO, FISHEYE]
+    tracemalloc.start()
+    try:
+        filters, most = photo_filters(means, cameras), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 80 * len(means)
+    chosen = np.array([0, 131_071, 131_072, 399_999])
+    np.testing.assert_array_equal(filters[chosen], photo_filters(means[chosen], cameras))
 
 
 def pose_at(depth):
