@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 UPDATES = 0.25, 0.5, 0.75  # Parts of a training after which the scene says which pixels show what darker photos measure
 DARKER = 0.5  # Part of the longest exposure up to which a photo measures light
-LEAST_CODE = 3  # From which a photo measures light: half a code is at most a sixth of it
+LEAST_CODE = 3  # Of 255, from which a photo measures light: half a code is at most a sixth of it
 LEAST_PIXELS, LEAST_PART = 0.05, 0.25
 """Pixels of blending weight in darker photos from which they measure a Gaussian, and the part of its weight in a mean
 photo of the others that a mean darker photo must have."""
@@ -82,7 +82,7 @@ def _measured_radiance(
         if not dark:
             others += field.weighted_sums(camera, counts)
             continue
-        unclipped = (view.codes < view.levels).all(2, keepdims=True) & (view.codes >= LEAST_CODE)
+        unclipped = (view.codes < view.levels).all(2, keepdims=True) & (view.codes >= LEAST_CODE * (view.levels // 255))
         unclipped = counts * torch.tensor(unclipped, device=device)
         photo = field.response.decode(torch.tensor(view.image, device=device)) / view.exposure_time
         scene = field.render(view.camera, degree=degree).hdr.to(device)

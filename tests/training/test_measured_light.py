@@ -2,6 +2,7 @@
 
 import math
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,10 +54,14 @@ def test_estimates_are_replaced_where_a_darker_photo_measures_the_light():
         assert torch.equal(result[~white], estimates[0][~white])
 
 
-def test_a_photo_so_dark_that_the_light_has_no_code_does_not_measure_it():
+@pytest.mark.parametrize(("time", "depth", "code"), [(2.0**-15, 8, 0), (2.0**-13, 16, 2 * 257)])
+def test_a_photo_so_dark_that_the_light_has_few_codes_does_not_measure_it(time, depth, code):
+    """Also if it has 16 bits because it was averaged, where errors of 8 bits remain."""
     places = panel(0.5, 0.5)
-    shots = photos(field(places, (4.0,) * 3, 0.03), (1, 1, 2.0**-15, 1, 1, 1), (0,) * 6)
-    assert shots[2].codes.max() == 0
+    shots = photos(field(places, (4.0,) * 3, 0.03), (1, 1, time, 1, 1, 1), (0,) * 6)
+    if depth == 16:
+        shots[2] = replace(shots[2], codes=shots[2].codes.astype(np.uint16) * 257)
+    assert shots[2].codes.max() == code
     estimates = [torch.tensor([ESTIMATE] * 3 + [1.0] * 3).half().expand(48, 64, 6) for _ in shots]
     results = measured_estimates(field(places, (8.0,) * 3, 0.03), shots, estimates, 0)
     assert all(torch.equal(*pair) for pair in zip(results, estimates, strict=True))
