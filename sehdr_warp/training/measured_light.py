@@ -28,6 +28,8 @@ photo of the others that a mean darker photo must have."""
 LEAST_SHARE = 0.75  # Of a pixel's light that must be of Gaussians that are measured
 LARGEST_RATIO = 16.0  # By which measured light may differ from the scene's at once
 DEVIATION = 0.25 * math.log(2)  # Of the natural logarithm of measured light
+CERTAIN = 2.0
+"""Light of a file that is so many times as certain as what is measured stays if both differ by fewer DEVIATIONs."""
 
 
 def are_measured(views: Sequence[View]) -> bool:
@@ -52,6 +54,8 @@ def measured_estimates(
     field: RadianceField, views: Sequence[View], estimates: Sequence[Tensor], degree: int
 ) -> list[Tensor]:
     """Return the estimates of each view's clipped light, replaced where darker views measure it.
+
+    Light that a view's file states stays if it agrees, because it is more certain.
 
     Args:
         field: The radiance field, as far as it is trained.
@@ -112,4 +116,6 @@ def _replaced(
     white, some, total = cells.split(3, dim=2)
     replaced = torch.cat([total / some.clamp_min(1e-6), torch.full_like(total, 1 / DEVIATION)], 2)
     replaced = by_solid_angle(replaced.cpu(), view.camera).to(estimate)
-    return torch.where(((some > white / 2) & (white > 0)).repeat(1, 1, 2), replaced, estimate)
+    differs = (replaced - estimate)[..., :3].abs() > CERTAIN * DEVIATION  # As where a gain map ends below a lamp
+    differs |= estimate[..., 3:] < CERTAIN / DEVIATION
+    return torch.where((differs & (some > white / 2) & (white > 0)).repeat(1, 1, 2), replaced, estimate)

@@ -54,6 +54,19 @@ def test_estimates_are_replaced_where_a_darker_photo_measures_the_light():
         assert torch.equal(result[~white], estimates[0][~white])
 
 
+@pytest.mark.parametrize(("stated", "stays"), [(24.0, True), (30.0, True), (4.0, False)])
+def test_light_that_a_gain_map_states_stays_unless_a_darker_photo_contradicts(stated, stays):
+    """A gain map that ends at 4 times white states less than a lamp's light."""
+    places = panel(0.5, 0.5)
+    shots = photos(field(places, (24.0,) * 3, 0.03), (1, 1, 1 / 32, 1, 1, 1), (0,) * 6)
+    estimates = [torch.tensor([math.log(stated)] * 3 + [1 / 0.05] * 3).half().expand(48, 64, 6) for _ in shots]
+    result = measured_estimates(field(places, (8.0,) * 3, 0.03), shots, estimates, 0)[0]
+    inner = torch.from_numpy((shots[0].codes == 255).all(2))
+    expected = math.log(stated if stays else 24)
+    assert result[inner][:, 0].median() == pytest.approx(expected, abs=0.02)
+    assert result[inner][:, 3].median() == pytest.approx(20 if stays else 1 / DEVIATION, rel=1e-3)
+
+
 @pytest.mark.parametrize(("time", "depth", "code"), [(2.0**-15, 8, 0), (2.0**-13, 16, 2 * 257)])
 def test_a_photo_so_dark_that_the_light_has_few_codes_does_not_measure_it(time, depth, code):
     """Also if it has 16 bits because it was averaged, where errors of 8 bits remain."""
