@@ -91,9 +91,9 @@ def options_at_place(
     spread = (squares * (1 - along)).sum(1)
     variances = filters.square()
     wider = variances.maximum(EPS2D * (pixel_angle * distances).square())
-    shown, drawn = (area + each * spread + each.square() for each in (variances, wider))
+    in_photos, on_map = (area + each * spread + each.square() for each in (variances, wider))
     log_scales = (squares + wider[:, None]).log() / 2
-    shares = (shown / drawn).nan_to_num(1.0)  # Of those so large that a square of their area overflows
+    shares = (in_photos / on_map).nan_to_num(1.0)  # Of those so large that a square of their area overflows
     return PlaceOptions(log_scales, opacities * shares.sqrt(), NO_PIXEL, 0.0)
 
 

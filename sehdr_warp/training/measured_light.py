@@ -67,7 +67,7 @@ def measured_estimates(
     darker = [view.exposure_time <= DARKER * longest for view in views]
     radiance, measured = _measured_radiance(field, views, darker, degree)
     return [
-        _replaced(field, view, estimate, radiance, measured, degree) if estimate.any() else estimate
+        _replace(field, view, estimate, radiance, measured, degree) if estimate.any() else estimate
         for view, estimate in zip(views, estimates, strict=True)
     ]
 
@@ -77,7 +77,7 @@ def _measured_radiance(
 ) -> tuple[Tensor, Tensor]:
     """Return the radiance [N, 3] that darker views measure, and whether [N, 3] they do. Pixels count by their masks."""
     device, count = field.gaussians.means.device, field.gaussians.count
-    light, shown, others, every = (torch.zeros(count, size, device=device) for size in (3, 3, 1, 1))
+    light, weights, others, every = (torch.zeros(count, size, device=device) for size in (3, 3, 1, 1))
     for view, dark in zip(views, darker, strict=True):
         camera = field.camera_tensors(view.camera)
         counts = torch.ones(*view.codes.shape[:2], 1, device=device)
@@ -94,28 +94,28 @@ def _measured_radiance(
         images = torch.cat([unclipped * ratio, unclipped, counts], 2).float()
         sums = field.weighted_sums(camera, images)
         light += field.radiance_towards(view.camera.position, degree=degree) * sums[:, :3]
-        shown += sums[:, 3:6]
+        weights += sums[:, 3:6]
         every += sums[:, 6:]
     usual = others * (sum(darker) / (len(darker) - sum(darker)))
-    measured = (shown > LEAST_PIXELS) & (shown > every / 2) & (shown > LEAST_PART * usual)
-    return light / shown.clamp_min(1e-12), measured
+    measured = (weights > LEAST_PIXELS) & (weights > every / 2) & (weights > LEAST_PART * usual)
+    return light / weights.clamp_min(1e-12), measured
 
 
-def _replaced(
+def _replace(
     field: RadianceField, view: View, estimate: Tensor, radiance: Tensor, measured: Tensor, degree: int
 ) -> Tensor:
     """Return the estimates [h, w, 6] of a view, replaced where most of its light is of measured Gaussians."""
     own = field.radiance_towards(view.camera.position, degree=degree)
-    known = torch.where(measured, radiance, 0)
+    part = torch.where(measured, radiance, 0)
     whole = field.render_values(view.camera, torch.where(measured, radiance, own))
-    is_known = field.render_values(view.camera, known) > LEAST_SHARE * whole
+    is_known = field.render_values(view.camera, part) > LEAST_SHARE * whole
     clipped = torch.tensor(view.codes >= view.levels, device=whole.device)
     logarithm = (whole * (view.exposure_time / field.response.white)).clamp_min(1).log()
     parts = torch.cat([clipped, clipped & is_known, (clipped & is_known) * logarithm], 2).permute(2, 0, 1)[None]
     cells = F.interpolate(parts.float(), size=estimate.shape[:2], mode="area")[0].permute(1, 2, 0).to(estimate.device)
     white, some, total = cells.split(3, dim=2)
-    replaced = torch.cat([total / some.clamp_min(1e-6), torch.full_like(total, 1 / DEVIATION)], 2)
-    replaced = by_solid_angle(replaced.cpu(), view.camera).to(estimate)
-    differs = (replaced - estimate)[..., :3].abs() > CERTAIN * DEVIATION  # As where a gain map ends below a lamp
+    new = torch.cat([total / some.clamp_min(1e-6), torch.full_like(total, 1 / DEVIATION)], 2)
+    new = by_solid_angle(new.cpu(), view.camera).to(estimate)
+    differs = (new - estimate)[..., :3].abs() > CERTAIN * DEVIATION  # As where a gain map ends below a lamp
     differs |= estimate[..., 3:] < CERTAIN / DEVIATION
-    return torch.where((differs & (some > white / 2) & (white > 0)).repeat(1, 1, 2), replaced, estimate)
+    return torch.where((differs & (some > white / 2) & (white > 0)).repeat(1, 1, 2), new, estimate)
