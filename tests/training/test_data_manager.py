@@ -24,6 +24,7 @@ from sehdr_warp.training.training_views import ViewDataset, ViewStack
 
 from .recorded import captured
 from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, toy_scene
+from .wall_and_lamp import wall_and_lamp
 
 
 def test_every_photo_comes_once_before_any_comes_again():
@@ -152,33 +153,32 @@ def test_what_is_brought_is_the_view(device, truth):
             assert torch.equal(streamed.target.exposure_truth, whole.target.exposure_truth)
 
 
-def with_estimates(value, count):
-    return [torch.full((8, 8, 6), value).half() for _ in range(count)]
+@pytest.mark.parametrize("uploaded", [False, True])
+def test_views_have_the_estimates_that_replace_others(device, uploaded):
+    config = load_config("default", {"response.name": "srgb"})
+    manager = make_trainer(wall_and_lamp(response="srgb"), config, device).data_manager
+    assert manager.estimates is not None and not manager.has_measured
+    if uploaded:
+        manager.views = list(manager.views)
+    others = [torch.full_like(estimate, 2.0) for estimate in manager.estimates]
+    manager.replace_estimates(others)
+    assert manager.has_measured and all(torch.equal(*pair) for pair in zip(manager.estimates, others, strict=True))
+    for view in manager.views:
+        assert view.target.estimates.device == view.target.encoded.device and (view.target.estimates == 2).all()
 
 
-def test_estimates_that_are_replaced_reach_views_on_another_device(scene):
-    manager = make_trainer(scene, load_config("default", {"response.name": "srgb"})).data_manager
-    count = len(scene.train_views)
-    manager._dataset.estimates = with_estimates(1.0, count)
-    manager._dataset.device = torch.device("meta")
-    manager.views = list(manager._dataset)
-    manager.replace_estimates(with_estimates(2.0, count))
-    assert all(view.target.estimates.device.type == "meta" for view in manager.views)
-    assert all(bool((each == 2).all()) for each in manager.estimates)
-
-
-def test_views_in_the_slots_of_a_stream_get_estimates_that_are_replaced(scene, device):
-    manager = make_trainer(scene, load_config("default", {"response.name": "srgb"})).data_manager
-    count = len(scene.train_views)
-    manager._dataset.estimates = with_estimates(1.0, count)
-    manager.views = PhotoStream(manager._dataset)
+def test_a_stream_reads_views_again_that_it_forgot(device):
+    views = toy_scene().train_views
+    source = ViewDataset(views, EXPOSURE_TIME, device, truth=False, estimates=[torch.ones(8, 8, 6).half()] * len(views))
+    stream = PhotoStream(source)
     for value in (1.0, 2.0):
         if value == 2:
-            manager.replace_estimates(with_estimates(value, count))
+            source.estimates = [torch.full((8, 8, 6), value).half()] * len(views)
+            stream.forget()
         for index, following in ((0, 1), (1, 2), (2, None)):
-            manager.views.stage(index)
-            assert bool((manager.views.at(torch.tensor([index], device=device)).target.estimates == value).all())
-            manager.views.release(following)
+            stream.stage(index)
+            assert (stream.at(torch.tensor([index], device=device)).target.estimates == value).all()
+            stream.release(following)
 
 
 @pytest.mark.parametrize("change", [lambda scene: scene, unlike_photos])
