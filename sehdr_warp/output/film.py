@@ -46,6 +46,8 @@ class Transfer:
 _X265 = "log-level=error:repeat-headers=1"
 # x265 4 writes beyond its arrays for adaptive quantization of pictures narrower than 50 pixels.
 _X265_SMALL, _X265_SMALLEST_SIDE = ":aq-mode=0:no-cutree=1", 64
+# With B-frames, decoding times of films of one or two frames are whatever its memory held.
+_X265_SHORT, _X265_SHORTEST = ":bframes=0", 3
 # As if mastered on a Rec.2020 display of PEAK; the steps are 0.00002 and 0.0001 cd/m2. No pixel is brighter. The
 # mean of the brightest frame is not known while the first one is written; 0 states that.
 _MASTER = "hdr-opt=1:master-display=G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)L(10000000,50):max-cll=1000,0"
@@ -119,7 +121,7 @@ def write_film(
             # FFmpeg takes what stands before a colon for a protocol, and would connect to a URL.
             name = f"file:{temporary.absolute()}"
             with av.open(name, "w", format=container_format, options=options) as container:
-                stream = _add_stream(container, kind, fps, width, height)
+                stream = _add_stream(container, kind, fps, width, height, len(cameras))
                 if abs(aspect - 1) > _SQUARE:
                     stream.codec_context.sample_aspect_ratio = Fraction(aspect).limit_denominator(100)
                 for camera, ev in zip(_with_progress(cameras, out, tell), stops):
@@ -135,15 +137,16 @@ def write_film(
     return out
 
 
-def _add_stream(container: Any, kind: Transfer, fps: float, width: int, height: int) -> Any:
-    """Add the video stream of a film to a container of PyAV, and return it."""
+def _add_stream(container: Any, kind: Transfer, fps: float, width: int, height: int, count: int) -> Any:
+    """Add the video stream of a film of `count` frames to a container of PyAV, and return it."""
     stream = container.add_stream(kind.codec, rate=_frame_rate(fps))
     stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
     stream.options = kind.options
-    if kind.codec == "libx265" and min(width, height) < _X265_SMALLEST_SIDE:
-        stream.options = kind.options | {"x265-params": kind.options["x265-params"] + _X265_SMALL}
     context = stream.codec_context
     if kind.codec == "libx265":
+        small = _X265_SMALL if min(width, height) < _X265_SMALLEST_SIDE else ""
+        short = _X265_SHORT if count < _X265_SHORTEST else ""
+        stream.options = kind.options | {"x265-params": kind.options["x265-params"] + small + short}
         context.codec_tag = "hvc1"  # What Apple's players look for.
     context.color_primaries, context.color_trc, context.colorspace = kind.primaries, kind.curve, kind.matrix
     context.color_range = 1

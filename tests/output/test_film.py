@@ -134,6 +134,21 @@ def test_rates_that_no_film_has_are_refused(tmp_path, fps):
             run_render(Render(run=tmp_path, out=tmp_path / "o", cameras="orbit", film=FilmOptions(fps=fps), **films))
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_hevc_films_of_one_or_two_frames_need_no_clean_memory(tmp_path, count):
+    """Write in a process whose new memory is not zero: x265 takes decoding times of so few frames from it."""
+    code = f"""
+from tests.output.helpers import AnalyticRun
+from sehdr_warp.output.film import write_film
+cameras = [entry.camera.resized(96, 64) for entry in AnalyticRun().cameras]
+write_film(AnalyticRun(), {str(tmp_path / "f.mkv")!r}, cameras[:{count}], transfer="hdr10")
+"""
+    environment = {**os.environ, "MALLOC_PERTURB_": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr[-300:]
+    assert len(frames(tmp_path / "f.mkv")[0]) == count
+
+
 def test_small_hevc_films_leave_memory_whole(tmp_path):
     """Write in a process whose allocator checks each block when it is freed."""
     checker = "libc_malloc_debug.so.0"
