@@ -93,7 +93,8 @@ def with_photo_filters(gaussians: GaussianArrays, cameras: Sequence[Camera]) -> 
     """Return Gaussians with the filters of their training cameras, unless they have some or were compensated."""
     if gaussians.filters is not None or gaussians.photo_focals is None or not cameras:
         return gaussians
-    return replace(gaussians, filters=photo_filters(gaussians.means, cameras))
+    means = torch.from_numpy(gaussians.means.astype(np.float64))
+    return replace(gaussians, filters=photo_filters(means, cameras).mean.numpy())
 
 
 def to_normalized(gaussians: GaussianArrays, normalization: Normalization) -> GaussianArrays:

@@ -18,6 +18,7 @@ from torch import Tensor
 from ..errors import SehdrError
 from ..scene import Camera
 from .gaussians import PARAMETER_NAMES, Gaussians
+from .pixel_filter import PhotoFilters
 from .radiance_field import NO_DATA, RadianceField
 from .renders import DirectionalRender, RenderedView, require_camera
 
@@ -119,8 +120,6 @@ class PagedField(RadianceField):
         part = self._part(levels)
         if self.confidence is not None:  # Gathered here alone: other pictures of millions of Gaussians do not need it.
             part.confidence = self._of_rows(self.confidence, levels)
-        if self.filters is not None:
-            part.filters = self._of_rows(self.filters, levels)
         return part.render_directions(position, directions, **options)
 
     def radiance_towards(self, position: np.ndarray, *, degree: int | None = None) -> Tensor:
@@ -153,6 +152,10 @@ class PagedField(RadianceField):
         joined = {name: torch.cat([page[name] for page in pages]) for name in pages[0]}
         part = RadianceField(Gaussians(**joined), self.response, fusion=self.fusion, **_options(self))
         part.requires_grad_(False)
+        if self.filters is not None:
+            mean, least = self.filters
+            least = None if least is None else self._of_rows(least, levels)
+            part.filters = PhotoFilters(self._of_rows(mean, levels), least)
         return part
 
     def _page(self, key: tuple[int, int]) -> dict[str, Tensor]:

@@ -3,8 +3,8 @@
 The rasterizer adds a variance of EPS2D square pixels to each projected Gaussian. In a training these are pixels of the
 photos, and Gaussians are fitted with it. With a longer focal length in pixels, the same variance is less of the scene:
 small Gaussians shrink, and a lamp loses most of its light. With a shorter one it is more, and a lamp gains light.
-The same holds for pictures of all directions from a place that is nearer to a lamp than the photos, or farther: there
-the filter is a part of the scene's sizes.
+The same holds for pictures from a place that is nearer to a lamp than the photos, and for those of all directions from
+one that is farther: there the filter is a part of the scene's sizes.
 """
 
 import math
@@ -24,10 +24,9 @@ from .renders import CameraTensors
 
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
 TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
-MOST_CAMERAS = 128  # Each takes about a tenth of a second for a million Gaussians.
-PLACE_CAMERAS = 32  # The same for pictures from a place, which otherwise take seconds
+MOST_CAMERAS = 128  # On a CPU: each takes 0.04 seconds for a million Gaussians.
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
-ROWS = 1 << 17  # Gaussians that are projected at once: each takes 140 bytes meanwhile.
+ROWS = 1 << 17  # Gaussians that are projected at once: each takes 80 bytes meanwhile.
 NO_PIXEL = 1e6  # Pixels: the focal length of cameras whose pixels have next to no size
 NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
 
@@ -78,8 +77,8 @@ def options_at_place(
         focal_length: Of the photos, pixels.
         pixel_angle: Of the picture's pixels, radians.
     """
-    gaussians, filters = field.gaussians, field.filters
-    if filters is None:
+    gaussians = field.gaussians
+    if field.filters is None:
         return PlaceOptions(gaussians.log_scales, opacities, focal_length, pixel_angle)
     offsets = gaussians.means.detach() - place
     distances = offsets.norm(dim=1).clamp_min(NEAR)
@@ -89,7 +88,7 @@ def options_at_place(
     # Of the projection to a plane across the line of sight: determinant and trace of its covariance.
     area = (squares.roll(1, 1) * squares.roll(2, 1) * along).sum(1)
     spread = (squares * (1 - along)).sum(1)
-    variances = filters.square()
+    variances = field.filters.mean.square()
     wider = variances.maximum(EPS2D * (pixel_angle * distances).square())
     in_photos, on_map = (area + each * spread + each.square() for each in (variances, wider))
     log_scales = (squares + wider[:, None]).log() / 2
@@ -97,18 +96,67 @@ def options_at_place(
     return PlaceOptions(log_scales, opacities * shares.sqrt(), NO_PIXEL, 0.0)
 
 
-def filters_of(field: Any) -> Tensor | None:
-    """Return the filters [N] of a field's Gaussians in their unit, as its file states them or by its photos' cameras.
+class ViewOptions(NamedTuple):
+    """Arguments of rasterize() for a view from any place."""
+
+    log_scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    eps2d: float  # Square pixels
+
+
+def options_of_view(
+    field: Any, camera: CameraTensors, shapes: tuple[Tensor, Tensor, Tensor], opacities: Tensor
+) -> ViewOptions:
+    """Return arguments with which a view of any resolution, from any place, has the light of the photos.
+
+    Gaussians that the view resolves finer than every photo are enlarged: they are filtered as in the finest photo.
+
+    Args:
+        field: A RadianceField.
+        camera: Of the view.
+        shapes: Means, log_scales and quaternions of the Gaussians.
+        opacities: [N] of these.
+    """
+    means, log_scales, quaternions = shapes
+    if field.photo_focals is None or field.antialiased:  # Which keeps the light at every resolution
+        return ViewOptions(log_scales, opacities, EPS2D)
+    fx, fy = camera.intrinsics[:2].tolist()
+    variance = field.photo_focals.variance(fx)
+    least = None if field.filters is None else field.filters.least
+    if least is not None:
+        local = means.detach() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        areas = _pixel_areas(local, fx, fy, camera.directions is None)
+        lacking = (least.square() - variance * areas)[:, None]
+        larger = ((2 * log_scales).exp() + lacking.clamp_min(0)).log() / 2
+        log_scales = torch.where(lacking > 0, larger, log_scales)
+    if variance < EPS2D and camera.directions is None:
+        opacities = keep_light(opacities, means, log_scales, quaternions, camera, variance)
+    return ViewOptions(log_scales, opacities, max(variance, EPS2D))
+
+
+class PhotoFilters(NamedTuple):
+    """Standard deviations [N] of the photos' filter where Gaussians are, in their unit."""
+
+    mean: Tensor  # Geometric mean of the photos that show the place, or that of the nearest photo if none does
+    least: Tensor | None  # That of the photo that shows it finest, 0 if none does; None without photos
+
+
+def filters_of(field: Any) -> PhotoFilters | None:
+    """Return the filters of a field's Gaussians, as its file states them or by its photos' cameras.
 
     None if neither is known, or if opacities make up for the filter.
     """
-    filters, means = field.photo_filters, field.gaussians.means
+    means, stated = field.gaussians.means.detach(), field.photo_filters
     if field.antialiased:
         return None
-    if filters is None and field.photo_cameras:
-        places = field.normalization.scene_points(means.detach().double().cpu().numpy())
-        filters = photo_filters(places, every_nth(field.photo_cameras, PLACE_CAMERAS)) / field.normalization.unit
-    return None if filters is None else torch.tensor(filters, dtype=torch.float32, device=means.device).clamp_min(NEAR)
+    filters = None
+    if field.photo_cameras:
+        cameras = [field.normalization.camera(camera) for camera in field.photo_cameras]
+        filters = photo_filters(means, cameras, field.render_device)
+    if stated is not None:
+        mean = torch.tensor(stated, dtype=torch.float32, device=means.device)
+        filters = PhotoFilters(mean, filters and filters.least)
+    return filters and filters._replace(mean=filters.mean.clamp_min(NEAR))
 
 
 def samples_across_pixel(field: Any, camera: Camera) -> int:
@@ -126,39 +174,64 @@ def samples_across_pixel(field: Any, camera: Camera) -> int:
     return max(1, min(resolves_photos, math.isqrt(MOST_PIXELS // camera.pixel_count)))
 
 
-def photo_filters(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the standard deviations [N] of the photos' filter where Gaussians are, in scene units.
+def photo_filters(means: Tensor, cameras: Sequence[Camera], device: torch.device | str | None = None) -> PhotoFilters:
+    """Return the photos' filter where Gaussians are, float32.
 
-    It is the geometric mean of those of the cameras that have the place in their picture, or that of the nearest camera
-    if none has; of more than MOST_CAMERAS, a part is asked. A round Gaussian as large as a camera's filter covers the
-    area of that filter.
+    A round Gaussian as large as a camera's filter covers the area of that filter.
 
     Args:
-        means: [N, 3] scene coordinates.
-        cameras: Training cameras, one or more.
+        means: [N, 3] in the cameras' coordinates.
+        cameras: Training cameras, one or more; of more than MOST_CAMERAS, a CPU looks at a part.
+        device: To compute on, by default that of the means.
     """
-    from scipy.spatial import KDTree
+    device = torch.device(device or means.device)
+    cameras = every_nth(cameras, MOST_CAMERAS) if device.type == "cpu" else cameras
+    parts = [_filters_of_part(part.to(device), cameras) for part in means.split(ROWS)]
+    mean, least = (torch.cat(parts).to(means.device, torch.float32) for parts in zip(*parts, strict=True))
+    return PhotoFilters(mean, least)
 
-    if len(means) > ROWS:
-        parts = np.split(means, range(ROWS, len(means), ROWS))
-        return np.concatenate([photo_filters(part, cameras) for part in parts])
-    angles = np.array([1 / math.sqrt(camera.fx * camera.fy) for camera in cameras])
-    nearest, index = KDTree(np.stack([camera.position for camera in cameras])).query(means)
-    count, logarithms = np.zeros(len(means)), np.zeros(len(means))
-    for camera, angle in zip(every_nth(cameras, MOST_CAMERAS), every_nth(angles, MOST_CAMERAS), strict=True):
-        if camera.is_pinhole:
-            projected = camera.project(means)
-            rows = np.flatnonzero(projected.inside)
-            tilts = np.log(projected.depth[rows])
-        else:
-            local = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-            rows, tilts = np.flatnonzero(np.isfinite(pixels_of_directions(local, camera)).all(axis=1)), 0.0
-        distances = np.log(np.maximum(np.linalg.norm(means[rows] - camera.position, axis=1), NEAR))
-        # A pixel covers depth^3 / (distance fx fy) of a sphere about the camera at this distance.
-        logarithms[rows] += math.log(angle) + (1.5 * tilts - 0.5 * distances if camera.is_pinhole else distances)
-        count[rows] += 1
-    pixels = np.where(count > 0, np.exp(logarithms / np.maximum(count, 1)), np.maximum(nearest, NEAR) * angles[index])
-    return (math.sqrt(EPS2D) * pixels).astype(np.float32)
+
+def _filters_of_part(means: Tensor, cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
+    """Return photo_filters() of some Gaussians, in the type of their means."""
+    count, logarithms = means.new_zeros(len(means)), means.new_zeros(len(means))
+    least = means.new_full((len(means),), math.inf)
+    for camera in cameras:
+        pose = means.new_tensor(camera.world_to_camera)
+        local = means @ pose[:3, :3].T + pose[:3, 3]
+        areas = _pixel_areas(local, camera.fx, camera.fy, camera.is_pinhole)
+        areas = areas.where(_is_shown(local, camera), math.inf)
+        shown = areas < math.inf
+        least = least.minimum(areas)
+        logarithms += areas.log().masked_fill_(~shown, 0)
+        count += shown
+    mean = (logarithms / count.clamp_min(1)).exp()
+    if len(unseen := (count == 0).nonzero()[:, 0]):
+        from scipy.spatial import KDTree
+
+        angles = np.array([camera.fx * camera.fy for camera in cameras])
+        nearest, index = KDTree(np.stack([camera.position for camera in cameras])).query(means[unseen].cpu().numpy())
+        mean[unseen] = means.new_tensor(np.maximum(nearest, NEAR) ** 2 / angles[index])
+        least[unseen] = 0
+    # Rounding must not make it larger than the pixels of the finest photo itself.
+    return (EPS2D * mean).sqrt(), (EPS2D * least).sqrt() * (1 - ROUNDING)
+
+
+def _pixel_areas(local: Tensor, fx: float, fy: float, is_pinhole: bool) -> Tensor:
+    """Return what areas [N] a pixel covers of spheres about a camera through positions [N, 3] in its axes."""
+    areas = local.square().sum(1).clamp_min(NEAR**2)
+    if is_pinhole:  # depth^3 / distance instead of distance^2
+        areas = local[:, 2].clamp_min(NEAR) ** 3 * areas.rsqrt()
+    return areas / (fx * fy)
+
+
+def _is_shown(local: Tensor, camera: Camera) -> Tensor:
+    """Return whether [N] a camera has positions [N, 3], in its axes, in its picture; occlusion is not considered."""
+    if not camera.is_pinhole:
+        rows = pixels_of_directions(local.double().cpu().numpy(), camera)
+        return torch.from_numpy(np.isfinite(rows).all(axis=1)).to(local.device)
+    x, y, depth = local.unbind(1)
+    columns, rows = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+    return (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height) & (depth > NEAR)
 
 
 def keep_light(

@@ -21,7 +21,7 @@ from ..scene.normalization import Normalization
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
-from .pixel_filter import EPS2D, FocalRange, PlaceOptions, filters_of, keep_light, options_at_place
+from .pixel_filter import FocalRange, PhotoFilters, PlaceOptions, filters_of, options_at_place, options_of_view
 from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, require_camera, unpremultiply
 
 NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
@@ -93,7 +93,7 @@ class RadianceField(nn.Module):
         return self.gaussians.means.device
 
     @cached_property
-    def filters(self) -> Tensor | None:
+    def filters(self) -> PhotoFilters | None:
         """The photos' filter at each Gaussian, as of filters_of(); the Gaussians must not move any more."""
         return filters_of(self)
 
@@ -341,18 +341,14 @@ class RadianceField(nn.Module):
         opacities: [N]. Without them, gradients reach the features alone.
         """
         gaussians = self.gaussians
-        shapes = gaussians.means, gaussians.log_scales, gaussians.quaternions
+        means, log_scales, quaternions = gaussians.means, gaussians.log_scales, gaussians.quaternions
         if opacities is None:
-            means, log_scales, quaternions = shapes
-            shapes = means.detach(), log_scales.detach(), quaternions.detach()
+            means, log_scales, quaternions = means.detach(), log_scales.detach(), quaternions.detach()
             opacities = gaussians.opacities().detach()
+        log_scales, opacities, eps2d = options_of_view(self, camera, (means, log_scales, quaternions), opacities)
+        shapes = means, log_scales, quaternions
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities, at_place)
-        variance = EPS2D
-        if self.photo_focals is not None and not self.antialiased:  # Which keeps the light at every resolution.
-            variance = self.photo_focals.variance(float(camera.intrinsics[0]))
-            if variance < EPS2D:
-                opacities = keep_light(opacities, *shapes, camera, variance)
         return self.rasterizer(  # rasterize(), see the class
             *shapes,
             opacities,
@@ -361,7 +357,7 @@ class RadianceField(nn.Module):
             camera.intrinsics,
             camera.width,
             camera.height,
-            eps2d=max(variance, EPS2D),
+            eps2d=eps2d,
             antialiased=self.antialiased,
             max_intersections=max_intersections,
             deterministic=self.deterministic,

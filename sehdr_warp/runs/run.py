@@ -16,7 +16,7 @@ from ..model.color_models import rec709_of
 from ..model.confidence import Evidence, gather_evidence
 from ..model.lights import Light, find_lights
 from ..model.paged_field import PagedField
-from ..model.pixel_filter import FocalRange, samples_across_pixel
+from ..model.pixel_filter import EPS2D, FocalRange, samples_across_pixel
 from ..model.radiance_field import RadianceField
 from ..model.renders import DirectionalRender, RenderedView
 from ..response import Response
@@ -194,6 +194,9 @@ class Splats(RenderableScene):
         self.path, self.field, self.cameras, self.world_matrix = path, field, cameras, world_matrix
         self.response, self.base_time, self.degree = field.response, field.base_time, field.gaussians.degree
         self.scene_name = path.stem
+        if (focals := field.photo_focals) is not None:  # Cameras of other focal lengths are not those of the photos.
+            views = [entry.camera for entry in cameras]
+            field.photo_cameras = [view for view in views if focals.variance(view.fx) == EPS2D]
 
 
 def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Splats:

@@ -128,3 +128,12 @@ def test_filters_of_other_gaussians_are_refused(tmp_path, run):
     stage.Save()
     with pytest.raises(InputError, match="its sehdr:filter has 2 values, not 60"):
         read_gaussians(file)
+
+
+def test_views_nearer_than_the_photos_have_all_light_where_cameras_lie_beside(tmp_path, run):
+    file = export(run, tmp_path / "a.ply", axes="scene", cameras=True)
+    near = camera(96, 72, position=(0, 0, -1.5))
+    expected, read = (float(scene.render(near).hdr.mean()) for scene in (run, load_splats(file)))
+    assert read == pytest.approx(expected, rel=0.01)
+    file.with_name("a.ply.cameras.json").unlink()
+    assert float(load_splats(file).render(near).hdr.mean()) < 0.7 * expected

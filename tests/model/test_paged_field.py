@@ -13,6 +13,7 @@ from sehdr_warp.model.confidence import gather_evidence
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.lights import find_lights
 from sehdr_warp.model.paged_field import PagedField, boxes_in_view
+from sehdr_warp.model.pixel_filter import FocalRange
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import on_device
@@ -63,6 +64,16 @@ def test_pictures_are_those_of_the_whole(street):
         assert torch.equal(part.hdr, whole.hdr) and torch.equal(part.confidence, paged.render_confidence(place))
     away = replace(place, world_to_camera=look_at((0, 0, 3), (0.1, 0, 9), up=(1.0, 0.0, 0.0)))
     assert paged.levels(away, away.position) == [] and not paged.render(away).alpha.any()
+
+
+def test_views_nearer_than_the_photos_are_those_of_the_whole(street):
+    paged, view = PagedField(street, CPU, budget=10**9), camera(20, ahead=2)
+    without = street.render(view).hdr
+    for field in (street, paged):
+        field.photo_cameras, field.photo_focals = [camera(20, ahead=2, height=12.0)], FocalRange(40.0, 40.0)
+    whole, part = street.render(view).hdr, paged.render(view).hdr
+    torch.testing.assert_close(whole, part)
+    assert not torch.allclose(whole, without)
 
 
 def test_an_entry_of_a_run_in_place_of_its_camera_is_named(street):

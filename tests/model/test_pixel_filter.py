@@ -1,7 +1,6 @@
 """Renders of another resolution than the photos give the same light."""
 
 import math
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from sehdr_warp import Camera, load_run
 from sehdr_warp.kernels.constants import EPS2D
+from sehdr_warp.model import pixel_filter
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.lights import received_light
 from sehdr_warp.model.pixel_filter import (
+    ROUNDING,
     FocalRange,
     keep_light,
     options_at_place,
@@ -94,7 +95,7 @@ def test_turned_flat_gaussians_keep_their_light_in_pixels_of_any_size(pixel_angl
         across = [null_space(sight[None]) for sight in sights]
         return [np.sqrt(np.linalg.det(a.T @ each @ a)) for a, each in zip(across, covariances, strict=True)]
 
-    expected = opacities.numpy() * areas(scales**2 + field.filters.numpy()[:, None] ** 2)
+    expected = opacities.numpy() * areas(scales**2 + field.filters.mean.numpy()[:, None] ** 2)
     light = options.opacities.numpy() * areas(np.exp(2 * options.log_scales.double().numpy()))
     np.testing.assert_allclose(light, expected, rtol=1e-5)
     if pixel_angle < 0.1:
@@ -114,7 +115,29 @@ def test_a_place_needs_no_filter_where_opacities_make_up_for_it():
     assert lamp([PHOTO], antialiased=True).filters is None and lamp([]).filters is None
     stated = lamp([PHOTO])
     stated.photo_filters = np.full(3, 0.25, np.float32)  # As a file states them
-    assert torch.equal(stated.filters, torch.full((3,), 0.25))
+    assert torch.equal(stated.filters.mean, torch.full((3,), 0.25))
+
+
+@pytest.mark.parametrize("camera", [PHOTO, FISHEYE], ids=["pinhole", "fisheye"])
+@pytest.mark.parametrize(("distance", "scale"), [(1.0, 1.0), (0.5, 1.0), (0.5, 2.0), (1.0, 0.5)])
+def test_views_that_are_nearer_to_a_lamp_than_the_photos_have_all_its_light(camera, distance, scale):
+    field, without = lamp([camera]), lamp([])
+    near = replace(camera, world_to_camera=pose_at(distance - 2.0))
+    expected = mean_light(without, camera, 1.0) * (2 / distance) ** 2
+    assert mean_light(field, near, scale) == pytest.approx(expected, rel=0.05)
+    assert mean_light(without, near, scale) < 0.7 * expected, "what happens without"
+
+
+def test_views_from_where_photos_are_or_farther_stay():
+    far = replace(PHOTO, world_to_camera=pose_at(3.0))
+    for photos in ([PHOTO], [far, PHOTO], [PHOTO, far]):
+        for view in (PHOTO, far):
+            assert torch.equal(lamp(photos).render(view).hdr, lamp([]).render(view).hdr)
+    behind = replace(PHOTO, world_to_camera=np.diag([-1.0, 1, -1, 1]))
+    near = replace(PHOTO, world_to_camera=pose_at(-1.5))
+    assert torch.equal(lamp([behind]).render(near).hdr, lamp([]).render(near).hdr), "no photo shows it"
+    compensated = lamp([PHOTO], antialiased=True), lamp([], antialiased=True)
+    assert torch.equal(*(field.render(near).hdr for field in compensated))
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0, 4.0])
@@ -161,14 +184,22 @@ def test_opacity_times_area_stays():
 def test_the_filter_of_photos_is_the_mean_of_cameras_that_show_a_place_or_of_the_nearest():
     near, far = (replace(PHOTO, world_to_camera=pose_at(depth)) for depth in (2.0, 8.0))
     pixel = math.sqrt(EPS2D) / 40
-    middle, behind = np.array([[0.0, 0, 0]]), np.array([[0.0, 0, -9.0]])
-    np.testing.assert_allclose(photo_filters(middle, [far]), 8 * pixel, rtol=1e-6)
-    np.testing.assert_allclose(photo_filters(middle, [far, near]), 4 * pixel, rtol=1e-6)
+    middle, behind = np.array([0.0, 0, 0]), np.array([0.0, 0, -9.0])
     aside = replace(near, cx=500.0)
-    np.testing.assert_allclose(photo_filters(middle, [far, aside]), 8 * pixel, rtol=1e-6)
-    np.testing.assert_allclose(photo_filters(behind, [far, near]), pixel, rtol=1e-6)
-    np.testing.assert_allclose(photo_filters(behind, [*[near] * 400, far]), pixel, rtol=1e-6, err_msg="of all cameras")
-    np.testing.assert_allclose(photo_filters(middle, [replace(FISHEYE, world_to_camera=pose_at(3.0))]), 3 * pixel)
+    for place, cameras, mean, least in (
+        (middle, [far], 8, 8),
+        (middle, [far, near], 4, 2),
+        (middle, [far, aside], 8, 8),
+        (behind, [far, near], 1, 0),
+        (middle, [replace(FISHEYE, world_to_camera=pose_at(3.0))], 3, 3),
+    ):
+        filters = filters_at(place[None], cameras)
+        np.testing.assert_allclose(filters.mean, mean * pixel, rtol=1e-6)
+        np.testing.assert_allclose(filters.least, (1 - ROUNDING) * least * pixel, rtol=1e-6)
+
+
+def filters_at(places, cameras):
+    return photo_filters(torch.from_numpy(places), cameras)
 
 
 @pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.1, 0.0)], ids=["to 180 degrees", "to 105 degrees"])
@@ -176,20 +207,18 @@ def test_fisheye_photos_have_no_part_in_filters_of_what_is_behind_them(distortio
     pixel, place = math.sqrt(EPS2D) / 40, np.array([[0.0, 0, 0]])
     ahead = replace(FISHEYE, projection="RADIAL_FISHEYE", distortion=distortion, world_to_camera=pose_at(2.0))
     behind = replace(ahead, world_to_camera=pose_at(-8.0))
-    np.testing.assert_allclose(photo_filters(place, [ahead, behind]), 2 * pixel)
+    np.testing.assert_allclose(filters_at(place, [ahead, behind]).mean, 2 * pixel, rtol=1e-6)
 
 
-def test_filters_of_many_gaussians_take_little_memory():
-    means = np.random.default_rng(0).uniform(-1, 1, (400_000, 3)) + np.array([0, 0, 2])
-    cameras = [PHOTO, FISHEYE]
-    tracemalloc.start()
-    try:
-        filters, most = photo_filters(means, cameras), tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert most < 80 * len(means)
-    chosen = np.array([0, 131_071, 131_072, 399_999])
-    np.testing.assert_array_equal(filters[chosen], photo_filters(means[chosen], cameras))
+def test_filters_are_computed_a_part_at_a_time(monkeypatch):
+    places = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + np.array([0, 0, 1.5])
+    whole, sizes = filters_at(places, [PHOTO, FISHEYE]), []
+    part = pixel_filter._filters_of_part
+    monkeypatch.setattr(pixel_filter, "ROWS", 8)
+    monkeypatch.setattr(pixel_filter, "_filters_of_part", lambda *rest: sizes.append(len(rest[0])) or part(*rest))
+    for one, other in zip(whole, filters_at(places, [PHOTO, FISHEYE]), strict=True):
+        torch.testing.assert_close(one, other)
+    assert sizes == [8, 8, 4]
 
 
 def pose_at(depth):
@@ -201,7 +230,7 @@ def pose_at(depth):
 
 def test_a_round_gaussian_covers_the_area_of_the_filter_anywhere_in_a_photo():
     places = np.array([[0.0, 0, 2], [1.1, 0.8, 2], [-1.1, 0.1, 2]])
-    filters = torch.from_numpy(photo_filters(places, [PHOTO])).double()
+    filters = filters_at(places, [PHOTO]).mean.double()
     pose, intrinsics = torch.eye(4, dtype=torch.float64), torch.from_numpy(PHOTO.intrinsics)
     quaternions, opacities = torch.tensor([[1.0, 0, 0, 0]] * 3).double(), torch.full((3,), 0.5).double()
     sizes = filters.log()[:, None].expand(3, 3)

@@ -15,6 +15,7 @@ def test_gaussians_of_a_trained_run_are_counted_in_its_own_coordinates(embedded_
     assert not field.normalization.is_identity
     plain = copy(field)
     plain.normalization = Normalization()
+    plain.photo_cameras = [field.normalization.camera(camera) for camera in field.photo_cameras]
     normalized = [field.normalization.camera(camera) for camera in cameras]
     views = count_views(field, cameras)
     assert float((views > 0).float().mean()) > 0.8
