@@ -94,8 +94,12 @@ def require_extra(module: str, purpose: str, extra: str) -> Any:
 
 
 def refuse_paths(loader: str, *values: object) -> None:
-    """Raise TypeError for a path in place of what `loader`() reads from it."""
+    """Raise TypeError for a path, or a list, in place of what `loader`() reads from a path."""
     for value in values:
+        if isinstance(value, list | tuple):
+            raise TypeError(
+                f"a {type(value).__name__} is not what sehdr_warp.{loader}() returns; pass its items one by one"
+            )
         if isinstance(value, str | os.PathLike):
             raise TypeError(f"{os.fspath(value)!r} is a path, expected what sehdr_warp.{loader}() returns for it")
 

@@ -17,10 +17,11 @@ from torch import Tensor
 
 from ..errors import SehdrError
 from ..scene import Camera
+from ..scene.camera import require_camera
 from .gaussians import PARAMETER_NAMES, Gaussians
 from .pixel_filter import PhotoFilters
 from .radiance_field import NO_DATA, RadianceField
-from .renders import DirectionalRender, RenderedView, require_camera
+from .renders import DirectionalRender, RenderedView
 
 CELL = 1 << 16  # Gaussians of a cell
 DEVIATIONS = 3.0  # Size of a Gaussian in the bounds of its cell, standard deviations

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..rasterizer.render_options import EPS2D
 from ..scene import Camera
+from ..scene.camera import require_camera
 from ..scene.wide_camera import pixels_of_directions
 from ..subsets import every_nth
 from .gaussians import rotate
@@ -168,6 +169,7 @@ def samples_across_pixel(field: Any, camera: Camera) -> int:
         field: A RadianceField or PagedField.
         camera: In any coordinates.
     """
+    require_camera(camera)
     if field.photo_focals is None or field.antialiased or not camera.is_pinhole:
         return 1
     resolves_photos = math.ceil(field.photo_focals.least / camera.fx - TOLERANCE)

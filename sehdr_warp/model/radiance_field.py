@@ -17,12 +17,13 @@ from ..rasterizer import Rendering, rasterize, rasterize_directions, spherical_h
 from ..rasterizer.cuda_graphs.runner import without_replays
 from ..response import Response
 from ..scene import Camera
+from ..scene.camera import require_camera
 from ..scene.normalization import Normalization
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
 from .pixel_filter import FocalRange, PhotoFilters, PlaceOptions, filters_of, options_at_place, options_of_view
-from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, require_camera, unpremultiply
+from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, unpremultiply
 
 NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
 _PIXELS_AT_ONCE = 1 << 19  # Of which colors are decoded

@@ -1,6 +1,8 @@
 """Cameras on a device, and what rendering a radiance field returns: a training view, a view, light along directions."""
 
+import math
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 import torch
@@ -109,10 +111,10 @@ class CameraTensors:
         return CameraTensors(camera.width, camera.height, *tensors, directions)  # pyright: ignore[reportCallIssue]
 
 
-def require_camera(camera: object) -> None:
-    """Raise TypeError for what is not a Camera, such as an entry of run.cameras."""
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera is a {type(camera).__name__}, expected a Camera, as run.cameras[0].camera is one")
+def require_time(time: object) -> None:
+    """Raise ValueError for an exposure time that is not a positive number."""
+    if not isinstance(time, Real) or not 0 < time < math.inf:
+        raise ValueError(f"exposure_time is {time!r}, expected seconds, such as 1 / 125")
 
 
 def unpremultiply(blended: Tensor, alpha: Tensor) -> Tensor:

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError, SehdrError, refuse_paths, require_extra
+from ..errors import InputError, SehdrError, did_you_mean, refuse_paths, require_extra
 from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
+from ..scene.camera import require_camera
 from .images.colorspace import color_space, matrix_to
 from .images.display import display_gain, encode_srgb
 from .render_views import shared_tone_map
@@ -101,10 +102,12 @@ def write_film(
             then.
 
     Raises:
-        SehdrError: Without PyAV (the extra `film`) or its encoder.
+        SehdrError: Without PyAV (the extra `film`) or its encoder, without cameras, or for another transfer or ramp.
+        TypeError: For what is not a Camera.
         InputError: If `out` exists (unless overwrite), or is not a film in one file by its suffix.
     """
     refuse_paths("load_run", run)
+    _check_options(cameras, transfer, ev_ramp)
     av, kind = film_library(), TRANSFERS[transfer]
     out, first, container_format = Path(out), cameras[0], film_format(out)
     check_rate(fps)
@@ -135,6 +138,19 @@ def write_film(
             remedy = f"choose {'.mov' if transfer in LOG_CURVES else '.mp4'} or another size"
             raise SehdrError(f"{out}: cannot be written as a film ({error}); {remedy}") from error
     return out
+
+
+def _check_options(cameras: Sequence[Camera], transfer: str, ev_ramp: tuple[float, float]) -> None:
+    """Raise for what no film can be made of; `cameras` may be something else than the annotation says."""
+    if isinstance(cameras, Camera) or not len(cameras):
+        raise SehdrError(f"cameras: {cameras or 'none'}; a film has a list of Cameras, one for each frame")
+    for camera in cameras:
+        require_camera(camera)
+    if transfer not in TRANSFERS:
+        hint = did_you_mean(transfer, TRANSFERS)
+        raise SehdrError(f"transfer {transfer!r} is not one of {', '.join(TRANSFERS)}{hint}")
+    if len(ev_ramp) != 2 or not np.isfinite(ev_ramp).all():
+        raise SehdrError(f"ev_ramp {ev_ramp} is not two numbers of stops, of the first and the last frame")
 
 
 def _add_stream(container: Any, kind: Transfer, fps: float, width: int, height: int, count: int) -> Any:

@@ -39,6 +39,8 @@ def _for_arrays(method: Callable[[Any, torch.Tensor], torch.Tensor]) -> _OfNumbe
                 raise TypeError(f"a response takes float32 or float64 tensors, not {numbers.dtype}")
             return method(self, numbers)
         array = np.asarray(numbers)
+        if array.dtype in (np.uint8, np.uint16):
+            raise TypeError(f"a response takes floats, not {array.dtype}; divide codes by {np.iinfo(array.dtype).max}")
         if array.dtype not in (np.float32, np.float64):
             array = array.astype(np.float32 if array.dtype == np.float16 else np.float64)
         # A copy: a negative stride or a read-only array is not a tensor.

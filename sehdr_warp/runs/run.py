@@ -18,7 +18,7 @@ from ..model.lights import Light, find_lights
 from ..model.paged_field import PagedField
 from ..model.pixel_filter import EPS2D, FocalRange, samples_across_pixel
 from ..model.radiance_field import RadianceField
-from ..model.renders import DirectionalRender, RenderedView
+from ..model.renders import DirectionalRender, RenderedView, require_time
 from ..response import Response
 from ..scene import Camera, Scene, load_cameras
 from ..scene.exposure.compensation import ExposureCompensation
@@ -141,6 +141,7 @@ class RenderableScene:
 
     def render_ldr(self, camera: Camera, exposure_time: float | None = None) -> Tensor:
         """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base exposure."""
+        require_time(self.base_time if exposure_time is None else exposure_time)
         return self.field.render_ldr(camera, exposure_time, degree=self.degree)
 
     def render_confidence(self, camera: Camera) -> Tensor | None:

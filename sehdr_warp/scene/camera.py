@@ -91,6 +91,10 @@ class Camera:
         pose = np.array(self.world_to_camera, dtype=np.float64)
         pose.setflags(write=False)
         object.__setattr__(self, "world_to_camera", pose)
+        if (self.width, self.height) != (int(self.width), int(self.height)):
+            raise ValueError(f"image size {self.width} x {self.height} is not in whole pixels")
+        object.__setattr__(self, "width", int(self.width))
+        object.__setattr__(self, "height", int(self.height))
         if self.width < 1 or self.height < 1:
             raise ValueError(f"image size {self.width} x {self.height} is not positive")
         if max(self.width, self.height) > MAX_SIDE:
@@ -197,3 +201,9 @@ class Camera:
         pose = np.array(values["world_to_camera"], dtype=np.float64)
         distortion = tuple(float(value) for value in values.get("distortion", ()))
         return Camera(width, height, fx, fy, cx, cy, pose, str(values.get("projection", "pinhole")), distortion)
+
+
+def require_camera(camera: object) -> None:
+    """Raise TypeError for what is not a Camera, such as an entry of run.cameras."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera is a {type(camera).__name__}, expected a Camera, as run.cameras[0].camera is one")

@@ -149,6 +149,25 @@ write_film(AnalyticRun(), {str(tmp_path / "f.mkv")!r}, cameras[:{count}], transf
     assert len(frames(tmp_path / "f.mkv")[0]) == count
 
 
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"cameras": []}, "cameras: none; a film has a list of Cameras"),
+        ({"cameras": AnalyticRun().cameras[0].camera}, r"cameras: Camera\(32 x 24.*; a film has a list of Cameras"),
+        ({"cameras": AnalyticRun().cameras}, "camera is a Entry, expected a Camera"),
+        ({"cameras": [("orbit_0", AnalyticRun().cameras[0].camera)]}, "camera is a tuple, expected a Camera"),
+        ({"transfer": "hdr"}, "transfer 'hdr' is not one of sdr, hlg, .*, did you mean hdr10?"),
+        ({"ev_ramp": (0.0, float("nan"))}, r"ev_ramp \(0.0, nan\) is not two numbers of stops"),
+        ({"ev_ramp": (1.0,)}, "is not two numbers of stops"),
+    ],
+)
+def test_what_is_no_film_is_named(tmp_path, changes, message):
+    arguments = {"cameras": [AnalyticRun().cameras[0].camera]} | changes
+    with pytest.raises((SehdrError, TypeError), match=message):
+        write_film(AnalyticRun(), tmp_path / "f.mp4", **arguments)
+    assert not list(tmp_path.iterdir())
+
+
 def test_small_hevc_films_leave_memory_whole(tmp_path):
     """Write in a process whose allocator checks each block when it is freed."""
     checker = "libc_malloc_debug.so.0"

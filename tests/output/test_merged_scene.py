@@ -115,3 +115,10 @@ def test_views_of_all_scenes_count(tmp_path, run):
 def test_a_page_holds_both(tmp_path, run, logged):
     write_scene_page(merge_scenes(run, other_of(tmp_path)), tmp_path / "both.html")
     assert any("both.html: 3 Gaussians" in line for line in logged)
+
+
+def test_a_list_of_scenes_is_refused(run):
+    with pytest.raises(
+        TypeError, match=r"a list is not what sehdr_warp.load_run\(\) returns; pass its items one by one"
+    ):
+        merge_scenes([run, run])

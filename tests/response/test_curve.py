@@ -144,3 +144,12 @@ def test_damaged_descriptions_are_refused(damage):
 def test_integer_tensors_are_refused():
     with pytest.raises(TypeError, match="float32"):
         response_by_name("srgb").encode(torch.tensor([128], dtype=torch.uint8))
+
+
+@pytest.mark.parametrize(("dtype", "most"), [(np.uint8, 255), (np.uint16, 65535)])
+def test_codes_that_are_not_divided_are_refused(dtype, most):
+    """Each code from 1 on would count as white."""
+    for call in (response_by_name("srgb").encode, response_by_name("srgb").decode):
+        with pytest.raises(TypeError, match=rf"takes floats, not {dtype.__name__}; divide codes by {most}"):
+            call(np.array([0, 128, most], dtype))
+        assert call([0, 1]) == pytest.approx([0, 1])

@@ -16,6 +16,7 @@ from sehdr_warp.scene.camera import limited_size
         ({"fy": 1e30}, "between 0.001 and 1e"),
         ({"cx": np.nan}, "not finite"),
         ({"width": 0}, "not positive"),
+        ({"width": 4.5}, "4.5 x 6 is not in whole pixels"),
         ({"width": 1 << 21}, "more than 1048576 pixels"),
         ({"world_to_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "not a proper rotation"),
         ({"world_to_camera": np.eye(3)}, "4 x 4"),
@@ -26,6 +27,12 @@ def test_an_impossible_camera_is_refused(values, problem):
     assert Camera(**camera).fx == 9.0
     with pytest.raises(ValueError, match=problem):
         Camera(**camera | values)
+
+
+def test_half_a_size_is_a_size():
+    camera = Camera(8, 6, 9.0, 9.0, 4.0, 3.0, np.eye(4))
+    half = camera.resized(8 / 2, np.int64(3))
+    assert (half.width, half.height) == (4, 3) and type(half.width) is type(half.height) is int
 
 
 def test_limited_size():

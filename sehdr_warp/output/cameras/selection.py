@@ -111,6 +111,11 @@ def _from_file(
 def check_cameras(cameras: str | Path) -> None:
     """Raise SehdrError if a choice of cameras is neither a known word nor a file."""
     words = (*SPLITS, *PATHS)
+    if not isinstance(cameras, str | Path):
+        remedy = "for a Camera of your own use run.render(camera), write_brackets, write_film, or write a cameras.json"
+        raise TypeError(
+            f"cameras is a {type(cameras).__name__}, expected one of {', '.join(words)} or a file; {remedy}"
+        )
     if str(cameras) not in words and not Path(cameras).exists():
         hint = did_you_mean(str(cameras), words)
         raise SehdrError(f"cameras {str(cameras)!r} are neither a file nor one of {', '.join(words)}{hint}")

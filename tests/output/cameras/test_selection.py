@@ -33,6 +33,8 @@ def test_several_cameras_are_chosen_from_by_name(tmp_path):
         with pytest.raises(SehdrError, match=message):
             select_cameras(run, "test", camera=f"{photo.name}x")
     assert len(load_cameras(tmp_path / "c.json")) == 5
+    with pytest.raises(TypeError, match=r"cameras is a list, expected one of train, test, .* or a file; for a Camera"):
+        select_cameras(run, [photo.camera])
 
 
 def test_size_keeps_the_vertical_field_of_view(tmp_path):
