@@ -3,6 +3,7 @@
 import itertools
 import os
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -241,13 +242,25 @@ def is_system_file(folder: str) -> bool:
     return folder.startswith((".", "@", "#", "$")) or folder == "__MACOSX"
 
 
+def _plain(name: str) -> str:
+    """Return a name in letters, digits and marks that need no quotes."""
+    return re.sub(r"[^\w.+-]", "_", name) or "view"
+
+
+def view_names_of(file_name: str) -> list[str]:
+    """Return the names that a view may have by the file name of its photo, with or without suffix."""
+    path = Path(file_name)
+    stem = path.stem if path.suffix.lower() in PHOTO_SUFFIXES else file_name
+    return [_plain(unicodedata.normalize(form, stem)) for form in ("NFC", "NFD")]
+
+
 def unique_names(records: Sequence[ImageRecord]) -> list[str]:
     """Return a name for each photo that can name a file, unique without regard to case.
 
     It is the view's key. If two photos share one (`train/r_0` and `test/r_0`), a test view keeps it, and others get
     their folder in front (`train_r_0`) or a number behind.
     """
-    plain = [re.sub(r"[^\w.+-]", "_", record.view) or "view" for record in records]
+    plain = [_plain(record.view) for record in records]
     counts = Counter(name.lower() for name in plain)
     shared = [counts[name.lower()] > 1 for name in plain]
     names, reserved = {}, set()

@@ -8,11 +8,13 @@ import numpy as np
 from ...errors import SehdrError, did_you_mean
 from ...scene import Camera
 from ...scene.camera_focus import camera_positions
+from ...scene.file_names import view_names_of
 from ...scene.gravity import up_direction
 from ...subsets import first_names
 
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene
+    from ...runs.run_folder import CameraEntry
 
 _ROUND_GAP = np.radians(120)  # A gap in azimuth smaller than this means that the photos go round the scene
 
@@ -27,17 +29,18 @@ def split_or_all(run: "RenderableScene", split: str) -> list[Camera]:
     return [entry.camera for entry in run.cameras if entry.split == split] or [entry.camera for entry in run.cameras]
 
 
-def camera_named(run: "RenderableScene", name: str) -> Camera:
-    """Return the camera of a view; raise SehdrError if the scene has none of this name."""
-    cameras = {entry.name: entry.camera for entry in run.cameras}
-    if not cameras:
+def view_named(run: "RenderableScene", name: str) -> "CameraEntry":
+    """Return a view by its name, or by the file name of its photo; raise SehdrError if the scene has none of it."""
+    views = {entry.name: entry for entry in run.cameras}
+    if not views:
         remedy = "give a run, or keep what `export --cameras` writes beside a file"
         raise SehdrError(f"{run.path}: has no cameras, and so no view {name!r}; {remedy}")
-    if name not in cameras:
-        some = first_names(list(cameras), 5)
-        hint = did_you_mean(name, cameras) or "; see scene.json of the run, or the cameras beside the file"
+    names = [each for each in (name, *view_names_of(name)) if each in views]
+    if not names:
+        some = first_names(list(views), 5)
+        hint = did_you_mean(name, views) or "; see scene.json of the run, or the cameras beside the file"
         raise SehdrError(f"view {name!r} is not one of the scene's ({some}){hint}")
-    return cameras[name]
+    return views[names[0]]
 
 
 def middle_index(cameras: Sequence[Camera]) -> int:

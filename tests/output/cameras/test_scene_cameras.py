@@ -1,7 +1,10 @@
-"""Paths around what a scene's cameras look at."""
+"""The cameras of a scene: paths around what they look at, and views by name."""
 
 import numpy as np
+import pytest
 
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.output.cameras.scene_cameras import view_named
 from sehdr_warp.output.cameras.selection import select_cameras
 
 from ..helpers import AnalyticRun, Entry, camera, sees
@@ -16,3 +19,21 @@ def test_orbit_of_parallel_cameras_uses_the_depth_seen():
     assert [name for name, _ in views] == [f"orbit_{i:03d}" for i in range(8)]
     for _, view in views:  # AnalyticRun's depth is 2 everywhere: the focus lies at z = -1.
         np.testing.assert_allclose(sees(view, (0.2, 0, -1)), (view.cx, view.cy), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("view", "photo"),
+    [
+        ("100_7104", "100_7104.JPG"),
+        ("r.0", "r.0.png"),
+        ("Bild_0___Schlo\xdf__\xe4_", "Bild 0 \u2013 Schlo\xdf (\xe4).HEIC"),
+        ("Bild_0___Schlo\xdf__a__", "Bild 0 \u2013 Schlo\xdf (\xe4)"),
+    ],
+)
+def test_a_view_is_named_as_the_file_of_its_photo(view, photo):
+    """macOS writes an accent as a letter of its own, which names of views have as `_`."""
+    run = AnalyticRun(((view, "train"), ("other", "test")))
+    assert view_named(run, photo) is view_named(run, view) is run.cameras[0]
+    assert [name for name, _ in select_cameras(run, "test", camera=photo)] == [view]
+    with pytest.raises(SehdrError, match="is not one of the scene's"):
+        view_named(run, f"x{photo}")
