@@ -258,11 +258,11 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
 def blocks_for(photos: int, pixels: float, config: Config) -> int:
     """Return the number of blocks for a set of photos with `pixels` in all.
 
-    Each block gets what one training has steps and Gaussians for.
+    Each block gets what one training has steps and Gaussians for, even if a preset for a quick look has fewer.
     """
     by_photos = OVERLAP * photos * STEPS_PER_PHOTO / REFERENCE_ITERATIONS
     gaussians = config.mcmc.cap_density * math.sqrt(pixels)
-    by_gaussians = OVERLAP * gaussians / config.densification.cap_max
+    by_gaussians = OVERLAP * gaussians / max(config.densification.cap_max, Config().densification.cap_max)
     if "densification.cap_max" in config.plan.keep or config.densification.strategy != "mcmc":
         by_gaussians = 0.0
     return max(1, math.ceil(max(by_photos, by_gaussians) - OVERLAP + 1))

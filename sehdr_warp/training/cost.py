@@ -191,8 +191,7 @@ def recommend(whole: Workload, divided: Workload, blocks: int, memory: float | N
     """Return which way suits a machine with `gpus` GPUs, and why, in one line; arguments as of choices()."""
     several = training_cost(whole, gpus)
     if blocks > 1:
-        fill = "30,000 steps or of densification.cap_max Gaussians"
-        return f"--blocks {blocks}: the set fills {blocks} trainings of {fill}"
+        return f"--blocks {blocks}: the set fills {blocks} trainings of 30,000 steps or of 3 million Gaussians"
     if memory is not None and several.gpu_bytes > memory:
         needs = f"{format_bytes(several.gpu_bytes)} are more than the {format_bytes(memory)} of a GPU"
         return f"--blocks {max(2, math.ceil(OVERLAP * training_cost(divided).gpu_bytes / memory))}: {needs}"

@@ -11,7 +11,7 @@ from sehdr_warp.blocks.train import train_in_blocks
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.config import Config
-from sehdr_warp.runs.config_files import override_config
+from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.training.compensation import SharedDecisions
@@ -127,3 +127,8 @@ def test_the_number_of_blocks_follows_photos_and_gaussians():
     assert blocks_for(300, 300 * 100e6, config) == 9, "3 million Gaussians for each"
     named = override_config(config, {"densification.cap_max": 10**6, "plan.keep": ["densification.cap_max"]})
     assert blocks_for(300, 300 * 100e6, named) == 1
+    for preset in ("fast", "demo"):
+        assert blocks_for(57, 57 * 1e6, load_config(preset)) == 1, "a quick look at few photos is one training"
+        assert blocks_for(1200, 1200 * 1e6, load_config(preset)) == 4
+    larger = override_config(config, {"densification.cap_max": 30 * 10**6})
+    assert blocks_for(300, 300 * 100e6, larger) == 1
