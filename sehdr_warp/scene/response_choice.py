@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import InputError, SehdrError
 from ..subsets import counted, every_nth, first_names
 from .dataparser import DataparserOutputs
-from .images.exif import are_camera_jpegs, exif_lens
+from .images.exif import are_camera_files, exif_lens
 from .images.gain_map import MOST_STOPS_IN_CODES, read_gain_map
 from .images.ldr_files import has_16_bits
 from .preprocess import read_codes
@@ -98,7 +98,7 @@ def select_for_codes(
     from ..response.selection import select_response
 
     curves = [response for name in candidates for response in responses_named(name)] or None
-    return select_response(codes, curves, method=method, from_camera=are_camera_jpegs(files))
+    return select_response(codes, curves, method=method, from_camera=are_camera_files(files))
 
 
 def check_response(dataset: DataparserOutputs, response: "str | Path | Response", path: Path | str) -> None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..scene import Camera, Scene, View, encoded_values
-from ..scene.images.exif import are_camera_jpegs
+from ..scene.images.exif import are_camera_files
 from ..scene.images.ldr_files import file_kind
 from ..scene.wide_camera import perspective_cameras, perspective_views
 from ..subsets import every_nth
@@ -72,7 +72,7 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
     return SceneFacts(
         photos=len(photos),
         pixels=sum(view.camera.pixel_count for view in photos),
-        from_camera=are_camera_jpegs([view.source for view in photos]),
+        from_camera=are_camera_files([view.source for view in photos]),
         truths=sum(view.hdr is not None for view in photos),
         points=len(scene.points),
         visibility=float(visible[visible > 0].mean()) if visible.any() else 0.0,

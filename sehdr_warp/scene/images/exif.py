@@ -10,6 +10,7 @@ from PIL import Image
 
 from ...errors import InputError
 from ..raw.decode import read_header
+from .heif import HEIF_SUFFIXES
 from .ldr_files import HDR_SUFFIXES, JPEG_SUFFIXES, PILLOW_ERRORS, RAW_SUFFIXES, exif_of, open_image
 from .xmp import xmp_of, xmp_values
 
@@ -99,9 +100,10 @@ def exif_texts(*values: Any) -> tuple[str, ...]:
     return tuple(str(value).strip(" \0") for value in values)
 
 
-def are_camera_jpegs(sources: Sequence[Path | None]) -> bool:
-    """Return whether most of the files are JPEGs of a camera: their EXIF states an exposure time or f-number."""
-    photos = (path for path in sources if path and path.suffix.lower() in JPEG_SUFFIXES and path.is_file())
+def are_camera_files(sources: Sequence[Path | None]) -> bool:
+    """Return whether most of the files are JPEG or HEIC of a camera: their EXIF states an exposure time or f-number."""
+    kinds = (*JPEG_SUFFIXES, *HEIF_SUFFIXES)
+    photos = (path for path in sources if path and path.suffix.lower() in kinds and path.is_file())
     exposures = [exif_exposure(photo) for photo in photos]
     return 2 * sum(bool(exposure.time or exposure.f_number) for exposure in exposures) > len(sources)
 

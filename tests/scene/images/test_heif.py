@@ -9,7 +9,7 @@ from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
 from sehdr_warp.scene.images import heif
-from sehdr_warp.scene.images.exif import exif_exposure
+from sehdr_warp.scene.images.exif import are_camera_files, exif_exposure
 from sehdr_warp.scene.images.ldr_files import image_sizes, read_ldr
 from tests.make_scenes import edited_json, load, write_blender
 
@@ -40,6 +40,7 @@ def test_a_heic_photo_is_upright_with_its_exposure(tmp_path):
     read = read_ldr(file, oriented=True).pixels.astype(int)
     assert np.abs(read - np.rot90(PIXELS, -1)).mean() < 3
     assert exif_exposure(file)[:2] == (0.01, 200)
+    assert are_camera_files([file]) and not are_camera_files([write_heic(tmp_path / "edited.heic")])
 
 
 def test_ten_bits_of_a_heic_photo(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from sehdr_warp.errors import InputError
-from sehdr_warp.scene.images.exif import are_camera_jpegs
+from sehdr_warp.scene.images.exif import are_camera_files
 from sehdr_warp.scene.images.hdr_files import hdr_size, read_hdr
 from sehdr_warp.scene.images.ldr_files import exif_of, has_16_bits, image_sizes, open_image, read_ldr
 from sehdr_warp.scene.masks import read_mask
@@ -127,9 +127,9 @@ def test_photos_made_by_a_camera(tmp_path):
     picture.save(tmp_path / "plain.jpg")
     picture.save(tmp_path / "screen.png", exif=tags)
     camera, plain, screen = (tmp_path / name for name in ("camera.JPG", "plain.jpg", "screen.png"))
-    assert are_camera_jpegs([camera]) and are_camera_jpegs([camera, camera, plain])
+    assert are_camera_files([camera]) and are_camera_files([camera, camera, plain])
     for others in ([plain], [screen], [camera, plain], [None], [tmp_path / "gone.jpg"], []):
-        assert not are_camera_jpegs(others)
+        assert not are_camera_files(others)
 
 
 @pytest.mark.parametrize("behind", [False, True])
