@@ -124,7 +124,7 @@ def run_render(args: Render) -> None:
         cameras = [camera for _, camera in select_cameras(run, **selection, transform=transform, up=args.world.up)]
         film = {"fps": fps, "transfer": args.film.transfer, "ev_ramp": ramp}
         files.append(write_film(run, args.video, cameras, **film, overwrite=args.overwrite))
-        if len(cameras) == 1:
+        if len(cameras) == 1 and args.count is None:
             selector = args.camera or args.cameras
             log.warning("%s: '%s' is one camera, so one frame; --cameras orbit is a path", args.video, selector)
         seconds = len(cameras) / fps

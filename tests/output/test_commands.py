@@ -30,6 +30,9 @@ def test_a_film_says_how_long_it_is(tmp_path, monkeypatch, capsys, caplog):
     assert "'test' is one camera, so one frame; --cameras orbit is a path" in caplog.text
     run_render(Render(run=tmp_path, video=tmp_path / "c.mp4", camera=run.cameras[0].name))
     assert f"'{run.cameras[0].name}' is one camera" in caplog.text
+    caplog.clear()
+    run_render(Render(run=tmp_path, video=tmp_path / "still.mp4", cameras="orbit", count=1))
+    assert not caplog.records, "one frame was asked for"
     for name, ramp, expected in (("d.mp4", "-1", (-1, -1)), ("e.mp4", "-4:4", (-4, 4))):
         options = FilmOptions(ev_ramp=ramp, fps=8)
         run_render(Render(run=tmp_path, video=tmp_path / name, cameras="interpolate", count=3, film=options))
