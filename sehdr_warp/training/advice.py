@@ -25,6 +25,7 @@ FALLING = 0.5  # dB that they lost since their best in a training that overfits;
 EXPOSURE_JUMP = 0.4  # Stops between a whole photo and the scene from which its exposure is not as stated
 FAILED = 17.0  # dB of held-out photos below which the scene as a whole is wrong: sound captures have 19 to 35
 _FEW_PHOTOS, _FEWEST_PHOTOS = 30, 5
+_FEW_STEPS = 3  # Steps that the user set for each photo up to which nothing is known of the photos
 _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say that something moved
 _MUCH_LIGHT = 0.5  # Share of the light in the photos from which it matters most that it is an estimate
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
@@ -95,6 +96,9 @@ class FinishedTraining:
         points, lines, gain = evaluations(summary["metrics"]), [], 0.0
         if self.misfit:
             return [f"the cameras that the set states do not fit its photos; find them anew {self._anew}"]
+        if self.steps is not None and iterations <= _FEW_STEPS * train_photos:
+            command = f"sehdr-warp train --resume --out {run} --iterations {STEPS_PER_PHOTO * train_photos}"
+            return [f"{iterations} steps are too few to judge {train_photos} photos by: {command}"]
         if (share := summary.get("estimated_light") or 0.0) > _MUCH_LIGHT:
             remedy = "darker photos would measure it; for which lights, and by how many stops"
             estimated = f"{share:.0%} of the light is an estimate, because photos clip it"

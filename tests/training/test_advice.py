@@ -28,6 +28,13 @@ def test_a_training_that_still_gains_is_advised_to_continue():
     assert line.endswith("sehdr-warp train --resume --out 'runs/my run' --iterations 180") and "2.0 dB" in line
 
 
+def test_a_few_steps_say_nothing_of_the_photos():
+    [line] = advice(Path("r"), summary([9, 9, 9], regions=400), 30, steps=90)
+    assert line == "90 steps are too few to judge 30 photos by: sehdr-warp train --resume --out r --iterations 2250"
+    for photos, steps in ((29, 90), (30, None)):  # More for each photo, or as many as were planned.
+        assert "does not fit" in advice(Path("r"), summary([9, 9, 9]), photos, steps=steps)[0]
+
+
 def test_gains_before_a_resume_do_not_count():
     """The last evaluation of a training has its moving average, so the one at a resume is the one to compare with."""
     figures = summary([20, 22, 24, 25.0, 25.1])
