@@ -1,9 +1,11 @@
 """Several scenes of the same coordinates as one."""
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +17,8 @@ from ..splats import GaussianArrays
 from ..splats.arrays import join_gaussians
 from .cameras.scene_cameras import training_cameras
 from .world_transform import WorldTransform, photos_to_scene
+
+log = logging.getLogger(__name__)
 
 
 class MergedScene(RenderableScene):
@@ -65,7 +69,22 @@ def merge_scenes(run: RenderableScene, *others: RenderableScene) -> MergedScene:
             of another one is not known, which would have to be included in its sizes.
     """
     refuse_paths("load_run", run, *others)
+    for other in others:
+        if _placed_apart(run, other):
+            problem = "were found apart, so their coordinates differ, and the scenes do not fit together"
+            remedy = "train both with cameras of one set, as of COLMAP"
+            log.warning("%s: its cameras and those of %s %s; %s", other.path, run.path, problem, remedy)
     return MergedScene((run, *others))
+
+
+def _placed_apart(first: RenderableScene, second: RenderableScene) -> bool:
+    """Return whether structure from motion placed the photos of each scene, and none of them alike in both."""
+    placed, others = (
+        {entry.placed.file: entry.placed.world_to_camera for entry in scene.cameras if entry.placed is not None}
+        for scene in (first, second)
+    )
+    alike = (np.allclose(placed[file], pose, atol=1e-3) for file, pose in others.items() if file in placed)
+    return bool(placed and others) and not any(alike)
 
 
 def _to_coordinates_of(first: RenderableScene, scene: RenderableScene) -> WorldTransform:

@@ -15,6 +15,7 @@ from sehdr_warp.model.lights import Light, ReceivedLight
 from sehdr_warp.model.renders import RenderedView
 from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
+from sehdr_warp.scene.dataparser import PlacedPhoto
 from sehdr_warp.scene.images.hdr_files import read_exr_channels
 from sehdr_warp.splats import GaussianArrays, write_gaussians
 
@@ -36,6 +37,7 @@ class Entry:
     split: str
     camera: Camera
     exposure_time: float = 0.5
+    placed: PlacedPhoto | None = None
 
 
 def rendered_view(*images):

@@ -14,6 +14,7 @@ from sehdr_warp.output.scene_page import write_scene_page
 from sehdr_warp.output.world_transform import world_transform
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run import load_splats
+from sehdr_warp.scene.dataparser import UNPLACED, PlacedPhoto
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.splats.arrays import HARMONIC_0
 
@@ -115,6 +116,22 @@ def test_views_of_all_scenes_count(tmp_path, run):
 def test_a_page_holds_both(tmp_path, run, logged):
     write_scene_page(merge_scenes(run, other_of(tmp_path)), tmp_path / "both.html")
     assert any("both.html: 3 Gaussians" in line for line in logged)
+
+
+@pytest.mark.parametrize("second, warned", [("same", False), ("turned", True), ("others", True), ("stated", False)])
+def test_scenes_whose_cameras_were_found_apart_are_named(tmp_path, run, caplog, second, warned):
+    """Each structure from motion has coordinates of its own, unless a photo is in the same place."""
+
+    def placed(entry, file=None):
+        pose = entry.camera.world_to_camera @ np.diag([-1.0, 1, -1, 1] if second == "turned" and file else [1.0] * 4)
+        return replace(entry, placed=PlacedPhoto(file or entry.name, UNPLACED, pose, "train", 1.0))
+
+    other = other_of(tmp_path)
+    names = {entry.name: f"x{entry.name}" if second == "others" else entry.name for entry in run.cameras}
+    other.cameras = run.cameras if second == "stated" else tuple(placed(each, names[each.name]) for each in run.cameras)
+    run.cameras = tuple(placed(entry) for entry in run.cameras)
+    merge_scenes(run, other)
+    assert ("were found apart, so their coordinates differ" in caplog.text) == warned
 
 
 def test_a_list_of_scenes_is_refused(run):
