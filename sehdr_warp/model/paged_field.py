@@ -153,6 +153,7 @@ class PagedField(RadianceField):
         joined = {name: torch.cat([page[name] for page in pages]) for name in pages[0]}
         part = RadianceField(Gaussians(**joined), self.response, fusion=self.fusion, **_options(self))
         part.requires_grad_(False)
+        part.photo_cameras = self.photo_cameras
         if self.filters is not None:
             mean, least = self.filters
             least = None if least is None else self._of_rows(least, levels)

@@ -26,6 +26,7 @@ from .renders import CameraTensors
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
 TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
 MOST_CAMERAS = 128  # On a CPU: each takes 0.04 seconds for a million Gaussians.
+MOST_AXES = 32
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
 ROWS = 1 << 17  # Gaussians that are projected at once: each takes 80 bytes meanwhile.
 NO_PIXEL = 1e6  # Pixels: the focal length of cameras whose pixels have next to no size
@@ -61,6 +62,7 @@ class PlaceOptions(NamedTuple):
     opacities: Tensor  # [N]
     focal_length: float  # Pixels
     pixel_angle: float  # Radians
+    axes: Tensor | None  # [A, 3] of photo_axes()
 
 
 def options_at_place(
@@ -78,9 +80,9 @@ def options_at_place(
         focal_length: Of the photos, pixels.
         pixel_angle: Of the picture's pixels, radians.
     """
-    gaussians = field.gaussians
+    gaussians, axes = field.gaussians, photo_axes(field)
     if field.filters is None:
-        return PlaceOptions(gaussians.log_scales, opacities, focal_length, pixel_angle)
+        return PlaceOptions(gaussians.log_scales, opacities, focal_length, pixel_angle, axes)
     offsets = gaussians.means.detach() - place
     distances = offsets.norm(dim=1).clamp_min(NEAR)
     turns = torch.cat([gaussians.quaternions[:, :1], -gaussians.quaternions[:, 1:]], dim=1).detach()
@@ -94,7 +96,32 @@ def options_at_place(
     in_photos, on_map = (area + each * spread + each.square() for each in (variances, wider))
     log_scales = (squares + wider[:, None]).log() / 2
     shares = (in_photos / on_map).nan_to_num(1.0)  # Of those so large that a square of their area overflows
-    return PlaceOptions(log_scales, opacities * shares.sqrt(), NO_PIXEL, 0.0)
+    return PlaceOptions(log_scales, opacities * shares.sqrt(), NO_PIXEL, 0.0, axes)
+
+
+def photo_axes(field: Any) -> Tensor | None:
+    """Return unit vectors [A, 3] along which pictures of all directions order Gaussians as the photos do.
+
+    What is behind others in all photos is not constrained, and may be in front of them in order of distance: those of
+    some of the photos, and of a cube. None without photos, or if some are wide, which order by distance.
+    """
+    cameras = every_nth(field.photo_cameras, MOST_AXES)
+    if not cameras or not all(camera.is_pinhole for camera in cameras):
+        return None
+    cube = cameras[len(cameras) // 2].world_to_camera[:3, :3]
+    axes = np.concatenate([[camera.world_to_camera[2, :3] for camera in cameras], cube, -cube])
+    return torch.tensor(axes, dtype=torch.float32, device=field.gaussians.means.device)
+
+
+def wide_options(
+    field: Any, camera: CameraTensors, log_scales: Tensor, opacities: Tensor, at_place: bool
+) -> PlaceOptions:
+    """Return arguments of rasterize_directions() for a wide camera, `at_place` as options_at_place() does."""
+    focal = float(camera.intrinsics[0])
+    photos = focal if field.photo_focals is None else field.photo_focals.nearest(focal)
+    if at_place:
+        return options_at_place(field, camera.position, opacities, photos, 1 / focal)
+    return PlaceOptions(log_scales, opacities, photos, 1 / focal, photo_axes(field))
 
 
 class ViewOptions(NamedTuple):

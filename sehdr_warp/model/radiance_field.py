@@ -22,7 +22,7 @@ from ..scene.normalization import Normalization
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
-from .pixel_filter import FocalRange, PhotoFilters, PlaceOptions, filters_of, options_at_place, options_of_view
+from .pixel_filter import FocalRange, PhotoFilters, filters_of, options_at_place, options_of_view, wide_options
 from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, unpremultiply
 
 NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
@@ -377,12 +377,8 @@ class RadianceField(nn.Module):
 
         shapes: means, log_scales and quaternions.
         """
-        focal = float(camera.intrinsics[0])
         means, log_scales, quaternions = shapes
-        photos = focal if self.photo_focals is None else self.photo_focals.nearest(focal)
-        options = PlaceOptions(log_scales, opacities, photos, 1 / focal)
-        if at_place:
-            options = options_at_place(self, camera.position, opacities, photos, 1 / focal)
+        options = wide_options(self, camera, log_scales, opacities, at_place)
         image, transmittance = rasterize_directions(
             means,
             quaternions=quaternions,

@@ -157,8 +157,10 @@ def compiled_rasterize(
 
 def _run_directions(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
     names = "focal_length", "pixel_angle", "antialiased", "near_plane", "alpha_threshold"
-    arguments: Any = *tensors[:6], tensors[6].detach()
-    return list(rasterize_directions(*arguments, **dict(zip(names, values, strict=True))))
+    directions, *axes = (tensor.detach() for tensor in tensors[6:])
+    options: Any = dict(zip(names, values, strict=True)) | {"axes": axes[0] if axes else None}
+    arguments: Any = *tensors[:6], directions
+    return list(rasterize_directions(*arguments, **options))
 
 
 _directions_op = register_custom_op(
@@ -186,10 +188,13 @@ def compiled_directions(
     antialiased: bool = False,
     near_plane: float = NEAR_PLANE,
     alpha_threshold: float = ALPHA_THRESHOLD,
+    axes: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Do what rasterize_directions() does, as a custom operator."""
-    tensors = _as_float(means, log_scales, quaternions, opacities, features, position, directions)
-    results = _directions_op(tensors, focal_length, pixel_angle, antialiased, near_plane, alpha_threshold)
+    tensors = [means, log_scales, quaternions, opacities, features, position, directions]
+    if axes is not None:
+        tensors.append(axes)
+    results = _directions_op(_as_float(*tensors), focal_length, pixel_angle, antialiased, near_plane, alpha_threshold)
     return results[0], results[1]
 
 

@@ -46,12 +46,13 @@ def rasterize_directions(
     antialiased: bool = False,
     near_plane: float = NEAR_PLANE,
     alpha_threshold: float = ALPHA_THRESHOLD,
+    axes: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend Gaussians along directions from a place: an environment map, or any picture of the sphere.
 
     Differentiable with respect to every tensor but the directions, which may not require a gradient. On the CPU
     gradients repeat bit for bit, whatever the number of threads. Neighboring pixels should look in neighboring
-    directions; blocks of 128 x 128 pixels are culled as one. Order is by distance from the position.
+    directions; blocks of 128 x 128 pixels are culled as one.
 
     Args:
         means: [N, 3]; this and the next four as rasterize() takes them.
@@ -68,6 +69,8 @@ def rasterize_directions(
         antialiased: as of rasterize(), but its factor is differentiated.
         near_plane: as of rasterize().
         alpha_threshold: as of rasterize().
+        axes: [A, 3] unit vectors. Gaussians are ordered by their depth along the one nearest to their direction, as in
+            perspective views along these; by default by their distance from the position.
 
     Returns:
         Image [H, W, C] and transmittance [H, W].
@@ -85,6 +88,8 @@ def rasterize_directions(
         position=(position, (3,)),
         directions=(directions, ("H", "W", 3)),
     )
+    if axes is not None:
+        check_tensors(means=(means, ("N", 3)), axes=(axes, ("A", 3)))
     check_channels(features)
     check_opacities(opacities)
     check_position(position)
@@ -110,7 +115,8 @@ def rasterize_directions(
         blended = splats.caps, splats.across, splats.along, opacities, features.contiguous()
         keep_emit_order = means.is_cpu and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in blended)
         directions = directions.contiguous()
-        lists = _list_tiles(splats.caps.detach(), splats.distances, directions, keep_emit_order)
+        depths = splats.distances if axes is None else _depths(splats, axes)
+        lists = _list_tiles(splats.caps.detach(), depths, directions, keep_emit_order)
         return _Blend.apply(*blended, directions, lists, alpha_threshold)
 
 
@@ -125,13 +131,22 @@ class _SphereSplats(NamedTuple):
 
 
 @torch.no_grad()
-def _list_tiles(caps: Tensor, distances: Tensor, directions: Tensor, keep_emit_order: bool) -> TileLists:
-    """List for each tile the Gaussians whose cap meets the tile's own, by distance."""
+def _depths(splats: _SphereSplats, axes: Tensor) -> Tensor:
+    """Return the depths [N] along the nearest of axes [A, 3], at least 0."""
+    cosines = torch.zeros_like(splats.distances)
+    for part in axes.split(8):  # Not [N, A] at once
+        cosines = cosines.maximum((splats.caps[:, :3] @ part.T).amax(1))
+    return splats.distances * cosines
+
+
+@torch.no_grad()
+def _list_tiles(caps: Tensor, depths: Tensor, directions: Tensor, keep_emit_order: bool) -> TileLists:
+    """List for each tile the Gaussians whose cap meets the tile's own, by depth."""
     count, (height, width) = len(caps), directions.shape[:2]
     grid = tile_grid(width, height)
     tile_caps, block_caps = (caps_of(directions, side * TILE_SIZE) for side in (1, BLOCK_TILES))
     kernel = sphere_kernels(warp_scalar(caps.dtype), 1).list_tiles
-    order = depth_order(distances, caps[:, 3:].expand(-1, 2).contiguous())
+    order = depth_order(depths, caps[:, 3:].expand(-1, 2).contiguous())
     shared = order, caps, tile_caps, block_caps, *grid
     counts, none = torch.empty_like(order), order[:0]
     launch(kernel, count, *shared, order, counts, none, none, min_range=256)

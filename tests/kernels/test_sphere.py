@@ -34,7 +34,7 @@ def latlong(size=64, dtype=torch.float64, device="cpu"):
     return torch.tensor(grid, dtype=dtype, device=device)
 
 
-def reference(means, log_scales, quaternions, opacities, features, directions, antialiased, pixel_angle):
+def reference(means, log_scales, quaternions, opacities, features, directions, antialiased, pixel_angle, views=None):
     """Every Gaussian at every pixel, in the plane that touches the sphere at its direction."""
     axes = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix() * np.exp(log_scales)[:, None]
     covariances = axes @ axes.swapaxes(1, 2)
@@ -42,7 +42,8 @@ def reference(means, log_scales, quaternions, opacities, features, directions, a
     footprint = EPS2D / FOCAL**2
     eps2d = max(footprint, EPS2D * pixel_angle**2)
     image, left = np.zeros((*directions.shape[:2], features.shape[1])), np.ones(directions.shape[:2])
-    for i in np.argsort(distances):
+    depths = distances if views is None else np.maximum((means @ views.T).max(1), 0)
+    for i in np.argsort(depths, kind="stable"):
         n = means[i] / distances[i]
         tangent = np.linalg.svd(n[None])[2][1:]
         bare = tangent @ covariances[i] @ tangent.T / distances[i] ** 2
@@ -75,6 +76,19 @@ def test_agrees_with_sums_in_numpy(device, antialiased, pixel_angle):
     floats = [tensor.float() for tensor in (*scene, position, directions)]
     image32, _ = rasterize_directions(*floats, **options)
     np.testing.assert_allclose(image32.cpu(), image.cpu(), atol=2e-3)
+
+
+@pytest.mark.parametrize("count", [1, 6, 20])
+def test_order_is_that_of_depths_along_the_nearest_axis(device, count):
+    scene, directions = gaussians(device=device, size=-1.0), latlong(device=device)
+    axes = np.concatenate([np.eye(3), -np.eye(3), Rotation.random(14, rng=0).as_matrix()[:, 2]])[:count]
+    axes = torch.tensor(axes, device=device)
+    position = torch.zeros(3, dtype=torch.float64, device=device)
+    image, _ = rasterize_directions(*scene, position, directions, focal_length=FOCAL, axes=axes)
+    arrays = [tensor.cpu().numpy() for tensor in (*scene, directions)]
+    np.testing.assert_allclose(image.cpu(), reference(*arrays, False, 0.0, axes.cpu().numpy())[0], atol=1e-3)
+    by_distance, _ = rasterize_directions(*scene, position, directions, focal_length=FOCAL)
+    assert float((image - by_distance).abs().max()) > 0.1
 
 
 def test_a_turned_scene_seen_in_turned_directions_is_the_same(device):

@@ -111,6 +111,24 @@ def test_a_map_has_gaussians_whose_squared_areas_overflow():
     assert light[0] == pytest.approx(light[1]) and light[0] > 1000
 
 
+def test_a_map_hides_what_photos_hide():
+    """A lamp is behind a white Gaussian by depth, and in front of it by distance."""
+    field, rays = lamps(), torch.tensor([[[0.3, 0.0, 1.0]]]) / math.hypot(0.3, 1.0)
+    means = torch.tensor([[0.4, 0.0, 2.01], [0.6, 0.0, 2.0], [0.0, 9.0, 1.0]])
+    sizes, colors = torch.tensor([0.2, 0.2, 0.001]).log()[:, None], torch.tensor([1000.0, 1.0, 1.0]).log()
+    field.gaussians.overwrite(
+        {"means": means, "log_scales": sizes.expand(3, 3), "opacity_logits": torch.full((3,), 9.0)}
+    )
+    field.gaussians.harmonics_dc.data = colors[:, None, None].expand(3, 1, 3) / 0.28209479
+    light = []
+    for cameras in ([PHOTO], [], [PHOTO, FISHEYE]):
+        vars(field).pop("filters", None)
+        field.photo_cameras = cameras
+        light.append(float(field.render_directions(np.zeros(3), rays, focal_length=40.0, pixel_angle=0.01).hdr.mean()))
+    assert light[0] < 10 and field.render(PHOTO).hdr[18, 36].mean() < 10
+    assert min(light[1:]) > 100, "by distance without photos, and if some are wide"
+
+
 def test_a_place_needs_no_filter_where_opacities_make_up_for_it():
     assert lamp([PHOTO], antialiased=True).filters is None and lamp([]).filters is None
     stated = lamp([PHOTO])

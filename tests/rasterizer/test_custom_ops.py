@@ -30,7 +30,7 @@ def step(*leaves):
         image = rendering.image * 2.0
         total = total + ssim(image, torch.full_like(image, 0.5)) + rendering.alpha.mean() + rendering.depth.mean()
         total = total + (rendering.means2d[:, 0] * rendering.visible).mean() + ssim_map(image, image.detach()).mean()
-    around, _ = rasterize_directions(*leaves[:5], torch.zeros(3), rays, focal_length=22.0)
+    around, _ = rasterize_directions(*leaves[:5], torch.zeros(3), rays, focal_length=22.0, axes=torch.eye(3))
     return total + around.sum()
 
 def gradients(function):
