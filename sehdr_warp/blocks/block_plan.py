@@ -108,13 +108,15 @@ class BlockPlan:
         return Division(self.axes, tuple(block.cell for block in self.blocks), margins, ())
 
     def config_of(self, block: Block) -> Config:
-        """Return the config of a block: its part of the budget of Gaussians.
+        """Return the config of a block: its part of the budget of Gaussians, and model.antialiased as requested.
 
         The budget is that of the requested mcmc.cap_density, 120 by default, on a GPU too. The plan of a training with
         many photos raises the default to training.plan.GPU_CAP_DENSITY and leaves the smaller value of a block; only a
-        block that has all photos is planned as one training.
+        block that has all photos is planned as one training. Blocks are rendered as one scene, so none turns on
+        model.antialiased by its own photos.
         """
-        root, fields = math.sqrt(block.fraction), {}
+        root = math.sqrt(block.fraction)
+        fields: dict[str, object] = {"plan.keep": sorted({*self.config.plan.keep, "model.antialiased"})}
         # These are multiples of the root of the block's pixels, and the budget of the set is divided by its pixels.
         for path in ("mcmc.cap_density", "model.initial_density"):
             table, name = path.split(".")

@@ -51,6 +51,9 @@ FEW_PHOTOS_DROPOUT = 0.2
 """model.dropout where photos are as few and each has DROPOUT_STEPS steps or more. Held-out photos of twelve captures
 gain 0.3 dB in the mean, and end 0.4 dB below their best in place of 0.6."""
 DROPOUT_STEPS = 250
+FOCAL_RATIO = 1.5
+"""Ratio of the photos' focal lengths in pixels from which model.antialiased is on. In a coarser photo the rasterizer
+widens a small Gaussian by more of the scene, so that no brightness of it fits coarse and fine photos."""
 MAX_EXPOSURE_RATIO = 2.0**16
 """Largest ratio of a bracket's exposure to the photos'; beyond, all 8-bit pixels are black or white."""
 COMPENSATION = "exposure-compensation"  # Name of the decision that compensation.py adds
@@ -337,6 +340,13 @@ def _dropout(facts: SceneFacts, config: Config, device: torch.device) -> Decisio
     return Decision({"model.dropout": FEW_PHOTOS_DROPOUT}, f"up to {FEW_PHOTOS_DROPOUT:.0%} of the Gaussians", reason)
 
 
+def _antialiasing(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
+    reason = f"focal lengths of the photos, in pixels, differ by a factor of {facts.focal_ratio:.1f}"
+    if config.model.antialiased or facts.focal_ratio < FOCAL_RATIO:
+        return Decision({}, "on" if config.model.antialiased else "off", reason)
+    return Decision({"model.antialiased": True}, "on", reason)
+
+
 def _confidence(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
     unsure = facts.clipped + facts.black
     reason = f"{unsure:.1%} of the pixels are clipped or black, and a point is visible in {facts.visibility:.1f} photos"
@@ -352,6 +362,7 @@ RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Decision]] = {
     "iterations": _iterations,
     "rates": _rates,
     "dropout": _dropout,
+    "antialiasing": _antialiasing,
     "confidence": _confidence,
 }
 """The rules of a plan, in order."""

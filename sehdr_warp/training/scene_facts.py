@@ -56,6 +56,7 @@ class SceneFacts:
     plateau: int = 0  # Code of 255, below 255, at which the photos clip, as after an edit; 0 if they do not
     pixel_bytes: int = 3  # Bytes of a pixel of the photos on a device, with its mask
     clipped_when_dark: float = 0.0  # As `clipped`, of the photos with the shortest exposures, three or more
+    focal_ratio: float = 1.0  # Of focal lengths in pixels: the 90th percentile over the 10th
 
 
 def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
@@ -86,7 +87,14 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         plateau=0 if scene.light_known else _plateau(read_views),
         pixel_bytes=pixel_bytes(photos),
         clipped_when_dark=float(_photo_statistics(dark_views)[:, 0].mean()),
+        focal_ratio=_focal_ratio(cameras),
     )
+
+
+def _focal_ratio(cameras: Sequence[Camera]) -> float:
+    """Return how much finer some cameras resolve a place from one distance than others: SceneFacts.focal_ratio."""
+    shortest, longest = np.quantile([math.sqrt(camera.fx * camera.fy) for camera in cameras], [0.1, 0.9])
+    return float(longest / shortest)
 
 
 def is_large(scene: Scene) -> bool:

@@ -1,6 +1,7 @@
 """blocks.json as somebody may have sent it: names and links that lead elsewhere, and odd shapes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from sehdr_warp.runs.config_files import load_config, override_config
 from sehdr_warp.scene import Camera
 from sehdr_warp.scene.normalization import Normalization
 from sehdr_warp.training.compensation import SharedDecisions
+from sehdr_warp.training.plan import make_plan
 from tests.make_scenes import edited_json
+from tests.training.toy import toy_scene, with_smaller_photos
 
 DATA = {"path": "photos"}
 
@@ -46,6 +49,15 @@ def test_a_plan_is_read_as_it_was_written(tmp_path, plan):
     ]
     assert read.cameras["photo_0"].to_dict() == plan.cameras["photo_0"].to_dict()
     assert read.blocks[0].cell.high[0] == 0 and np.isinf(read.blocks[0].cell.low).all()
+
+
+def test_blocks_agree_on_opacity_compensation_whatever_their_photos(plan):
+    mixed = with_smaller_photos(toy_scene(), 1 / 3)
+    assert make_plan(mixed, Config()).config.model.antialiased
+    for block in plan.blocks:
+        assert not make_plan(mixed, plan.config_of(block)).config.model.antialiased
+    own = replace(plan, config=override_config(plan.config, {"model.antialiased": True}))
+    assert all(own.config_of(block).model.antialiased for block in own.blocks)
 
 
 @pytest.mark.parametrize(

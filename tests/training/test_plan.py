@@ -19,7 +19,7 @@ from sehdr_warp.training.strategies import mcmc_cap
 from sehdr_warp.training.train import create_trainer, train
 
 from ..refusals import call
-from .toy import orbit_camera, toy_scene
+from .toy import orbit_camera, toy_scene, with_smaller_photos
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
 
@@ -118,6 +118,16 @@ def test_photos_whose_exposure_drifts_unsaid_get_a_line(scene):
             assert len(lines) == count
     plain = make_plan(replace(scene, exposure_times_known=False), config_of())
     assert not any("exposure times" in line for line in plain.lines())
+
+
+@pytest.mark.parametrize(("part", "on"), [(1 / 3, True), (0.7, False)])
+def test_opacities_are_compensated_where_photos_differ_in_resolution(scene, part, on):
+    mixed = with_smaller_photos(scene, part)
+    plan = make_plan(mixed, config_of())
+    assert plan.config.model.antialiased == on
+    assert measure_scene(mixed).focal_ratio == pytest.approx(1 / part, rel=0.05)
+    own = make_plan(mixed, config_of(model__antialiased=False, plan__keep=["model.antialiased"]))
+    assert not own.config.model.antialiased and not make_plan(scene, config_of()).config.model.antialiased
 
 
 def test_rates_of_a_short_training_are_raised_once_and_those_given_stay(scene, facts):

@@ -127,3 +127,14 @@ def without_truth(scene: Scene, *names: str) -> Scene:
         for view in scene.views
     )
     return replace(scene, views=tuple(views))
+
+
+def with_smaller_photos(scene: Scene, part: float) -> Scene:
+    """Return a scene of square photos whose every second view has a part of its resolution."""
+
+    def smaller(view: View) -> View:
+        size = round(part * view.camera.width)
+        return replace(view, camera=view.camera.resized(size, size), codes=view.codes[:size, :size], hdr=None)
+
+    views = tuple(smaller(view) if index % 2 else view for index, view in enumerate(scene.views))
+    return replace(scene, views=views)
