@@ -5,6 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..runs.config_files import config_fields
@@ -30,6 +31,7 @@ _MANY_REGIONS = 5  # Unexplained regions for each photo, on average, that say th
 _MUCH_LIGHT = 0.5  # Share of the light in the photos from which it matters most that it is an estimate
 _REGION_STOPS = 1.5  # Median difference of the worst regions from which things moved rather than blurred
 _WRONG_STOPS, _WRONG_AREA = 2.5, 0.12  # Difference, and part of a photo that has it, if its camera is wrong
+_DARK = 0.25  # Part of the median exposure up to which a photo was taken to measure lights
 _FEW = 0.1  # Part of the photos up to which they are single ones
 
 
@@ -71,6 +73,7 @@ class FinishedTraining:
     # Pixels of the training photos, by their names; without them no single camera is called wrong
     sizes: Mapping[str, int] = field(default_factory=dict)
     uncertain: Collection[str] = ()  # Names of the training photos that structure from motion placed by few points
+    dark: Collection[str] = ()  # Names of the training photos that are much darker than most, to measure lights
 
     def _command(self, scene: str, steps: int | None = None) -> str:
         """Return the command that trains a scene with the options of this training."""
@@ -154,9 +157,14 @@ class FinishedTraining:
         )
         if not jumps:
             return None
+        are_dark = all(name in self.dark for name in jumps)
+        jumps = jumps if are_dark else [name for name in jumps if name not in self.dark]
         names = first_names([f"{name} {offsets[name]:+.1f}" for name in jumps])
         what = f"{len(jumps)} photo{'s are' if len(jumps) > 1 else ' is'} brighter or darker than the scene as a whole"
-        if 2 * len(jumps) > len(offsets):
+        if are_dark:
+            reason = "where the response is wrong between dark and bright"
+            remedy = "keep them, because they measure lights; `sehdr-warp calibrate` measures the response"
+        elif 2 * len(jumps) > len(offsets):
             reason, remedy = "in photos of several days or cameras", "train on those of one day"
         else:
             reason = "where exposure or sun changed"
@@ -212,6 +220,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
     posed = None
     if folders and scene.format not in SFM_LAYOUTS:
         posed = folders.pop() if len(folders) == 1 else place  # No folder holds the photos of several alone.
+    usual = median(view.exposure_time for view in scene.train_views)
     training = FinishedTraining(
         run.path,
         run.summary() | {"metrics": run.metrics()},
@@ -225,6 +234,7 @@ def advice_on(trainer: "Trainer", data: LoadArguments, options: dict[str, Any]) 
         misfit=any(MISFIT in note for note in scene.notes),
         sizes={view.name: view.camera.pixel_count for view in scene.train_views},
         uncertain={view.name for view in scene.train_views if view.uncertain},
+        dark={view.name for view in scene.train_views if view.exposure_time <= _DARK * usual},
     )
     return training.advice()
 

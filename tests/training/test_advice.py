@@ -2,6 +2,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
+
 from sehdr_warp.runs.config_files import load_config
 from sehdr_warp.runs.config_flags import parse_field
 from sehdr_warp.scene.pose_conventions import MISFIT
@@ -71,6 +73,28 @@ def test_photos_of_another_exposure_are_named_with_the_command():
     assert line.endswith("or move these photos out of the folder: sehdr-warp train 'my photos' --out r --overwrite")
     figures["brightness_offsets"]["d"] = 1.0  # Most of them
     assert "as in photos of several days or cameras: train on those of one day" in advice(Path("r"), figures, 10)[0]
+
+
+def test_dark_photos_that_measure_lights_are_kept():
+    figures = summary([28, 28, 28], regions=100) | {"brightness_offsets": {"a": 0.6, "b": -0.9, "c": 0.1, "d": 0.0}}
+    [line] = advice(Path("r"), figures, 10, "room", dark={"a", "b"})
+    assert line.startswith("2 photos are brighter or darker") and "keep them, because they measure lights" in line
+    assert "move these" not in line and line.endswith("sehdr-warp train room --out r --overwrite")
+    [line] = advice(Path("r"), figures, 10, "room", dark={"a"})
+    assert line.startswith("1 photo is brighter or darker") and "(stops: b -0.9)" in line and "move these" in line
+
+
+@pytest.mark.parametrize(("factor", "kept"), [(0.5, False), (0.25, True)])
+def test_photos_of_a_quarter_of_the_usual_exposure_are_dark(factor, kept):
+    scene = toy_scene(6, 8)
+    dark = replace(scene.train_views[0], exposure_time=factor * scene.train_views[0].exposure_time)
+    scene = replace(scene, views=tuple(dark if view.name == dark.name else view for view in scene.views))
+    figures = summary([28, 28, 28]) | {"brightness_offsets": {dark.name: 0.9, "other": 0.0}}
+    run = SimpleNamespace(path=Path("r"), summary=lambda: figures, metrics=lambda: figures["metrics"])
+    config = SimpleNamespace(plan=SimpleNamespace(keep=[]))
+    facts = {"run": run, "iteration": 90, "total": 90, "first_iteration": 0, "config": config}
+    [line] = advice_on(SimpleNamespace(scene=scene, **facts), {"path": "set"}, {})
+    assert ("keep them, because they measure lights" in line) == kept
 
 
 def test_commands_keep_the_options_of_the_training():
