@@ -51,7 +51,7 @@ FEW_PHOTOS_DROPOUT = 0.2
 """model.dropout where photos are as few and each has DROPOUT_STEPS steps or more. Held-out photos of twelve captures
 gain 0.3 dB in the mean, and end 0.4 dB below their best in place of 0.6."""
 DROPOUT_STEPS = 250
-FOCAL_RATIO = 1.5
+FOCAL_RATIO = 1.25
 """Ratio of the photos' focal lengths in pixels from which model.antialiased is on. In a coarser photo the rasterizer
 widens a small Gaussian by more of the scene, so that no brightness of it fits coarse and fine photos."""
 MAX_EXPOSURE_RATIO = 2.0**16
