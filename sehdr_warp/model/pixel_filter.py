@@ -9,6 +9,7 @@ one that is farther: there the filter is a part of the scene's sizes.
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,12 +26,14 @@ from .renders import CameraTensors
 
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
 TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
-MOST_CAMERAS = 128  # On a CPU: each takes 0.04 seconds for a million Gaussians.
+MOST_CAMERAS = 128
+"""Of those that a CPU looks at: a pinhole takes 0.06 seconds for a million Gaussians, a fisheye 0.1 on any device."""
 MOST_AXES = 32
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
-ROWS = 1 << 17  # Gaussians that are projected at once: each takes 80 bytes meanwhile.
+ROWS, ROWS_GPU = 1 << 17, 1 << 20  # Gaussians that are projected at once: each takes 100 bytes meanwhile.
 NO_PIXEL = 1e6  # Pixels: the focal length of cameras whose pixels have next to no size
 NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
+REACH = 3.4  # Standard deviations at which opaque Gaussians end: their alpha is below the threshold.
 
 
 class FocalRange(NamedTuple):
@@ -154,9 +157,8 @@ def options_of_view(
     if least is not None:
         local = means.detach() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         areas = _pixel_areas(local, fx, fy, camera.directions is None)
-        lacking = (least.square() - variance * areas)[:, None]
-        larger = ((2 * log_scales).exp() + lacking.clamp_min(0)).log() / 2
-        log_scales = torch.where(lacking > 0, larger, log_scales)
+        lacking = (least.square() - variance * areas).nan_to_num(0).clamp_min(0)[:, None]
+        log_scales = torch.logaddexp(2 * log_scales, lacking.log()) / 2  # Unchanged, to the bit, by 0
     if variance < EPS2D and camera.directions is None:
         opacities = keep_light(opacities, means, log_scales, quaternions, camera, variance)
     return ViewOptions(log_scales, opacities, max(variance, EPS2D))
@@ -166,7 +168,7 @@ class PhotoFilters(NamedTuple):
     """Standard deviations [N] of the photos' filter where Gaussians are, in their unit."""
 
     mean: Tensor  # Geometric mean of the photos that show the place, or that of the nearest photo if none does
-    least: Tensor | None  # That of the photo that shows it finest, 0 if none does; None without photos
+    least: Tensor | None  # Of the photo that shows any part of it finest, 0 if none does; None without photos
 
 
 def filters_of(field: Any) -> PhotoFilters | None:
@@ -180,7 +182,8 @@ def filters_of(field: Any) -> PhotoFilters | None:
     filters = None
     if field.photo_cameras:
         cameras = [field.normalization.camera(camera) for camera in field.photo_cameras]
-        filters = photo_filters(means, cameras, field.render_device)
+        sizes = field.gaussians.log_scales.detach().amax(1).exp()
+        filters = photo_filters(means, cameras, sizes, field.render_device)
     if stated is not None:
         mean = torch.tensor(stated, dtype=torch.float32, device=means.device)
         filters = PhotoFilters(mean, filters and filters.least)
@@ -203,7 +206,9 @@ def samples_across_pixel(field: Any, camera: Camera) -> int:
     return max(1, min(resolves_photos, math.isqrt(MOST_PIXELS // camera.pixel_count)))
 
 
-def photo_filters(means: Tensor, cameras: Sequence[Camera], device: torch.device | str | None = None) -> PhotoFilters:
+def photo_filters(
+    means: Tensor, cameras: Sequence[Camera], sizes: Tensor | None = None, device: torch.device | str | None = None
+) -> PhotoFilters:
     """Return the photos' filter where Gaussians are, float32.
 
     A round Gaussian as large as a camera's filter covers the area of that filter.
@@ -211,28 +216,39 @@ def photo_filters(means: Tensor, cameras: Sequence[Camera], device: torch.device
     Args:
         means: [N, 3] in the cameras' coordinates.
         cameras: Training cameras, one or more; of more than MOST_CAMERAS, a CPU looks at a part.
+        sizes: [N] largest standard deviations, by default those of points.
         device: To compute on, by default that of the means.
     """
     device = torch.device(device or means.device)
-    cameras = every_nth(cameras, MOST_CAMERAS) if device.type == "cpu" else cameras
-    parts = [_filters_of_part(part.to(device), cameras) for part in means.split(ROWS)]
+    if device.type == "cpu" or not all(camera.is_pinhole for camera in cameras):
+        cameras = every_nth(cameras, MOST_CAMERAS)
+    rows = ROWS if device.type == "cpu" else ROWS_GPU
+    sizes = torch.zeros_like(means[:, 0]) if sizes is None else sizes
+    with torch.autocast(device.type, enabled=False):  # They are kept for later renders.
+        parts = [
+            _filters_of_part(part.to(device), part_sizes.to(device), cameras)
+            for part, part_sizes in zip(means.split(rows), sizes.split(rows), strict=True)
+        ]
     mean, least = (torch.cat(parts).to(means.device, torch.float32) for parts in zip(*parts, strict=True))
     return PhotoFilters(mean, least)
 
 
-def _filters_of_part(means: Tensor, cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
+def _filters_of_part(means: Tensor, sizes: Tensor, cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
     """Return photo_filters() of some Gaussians, in the type of their means."""
     count, logarithms = means.new_zeros(len(means)), means.new_zeros(len(means))
     least = means.new_full((len(means),), math.inf)
     for camera in cameras:
         pose = means.new_tensor(camera.world_to_camera)
         local = means @ pose[:3, :3].T + pose[:3, 3]
-        areas = _pixel_areas(local, camera.fx, camera.fy, camera.is_pinhole)
-        areas = areas.where(_is_shown(local, camera), math.inf)
-        shown = areas < math.inf
-        least = least.minimum(areas)
+        areas, beyond = _pixel_areas(local, camera.fx, camera.fy, camera.is_pinhole), _pixels_beyond(local, camera)
+        shown = (beyond <= 0) & (areas < math.inf)
         logarithms += areas.log().masked_fill_(~shown, 0)
         count += shown
+        # Along the radius, a pinhole's picture is enlarged by more.
+        tilts = local.norm(dim=1) / local[:, 2].clamp_min(NEAR) if camera.is_pinhole else 1.0
+        reach = REACH * (sizes.square() / areas * tilts + EPS2D).sqrt()
+        least = least.minimum(areas.masked_fill(~(beyond <= reach), math.inf))
+    least = least.masked_fill(least == math.inf, 0)
     mean = (logarithms / count.clamp_min(1)).exp()
     if len(unseen := (count == 0).nonzero()[:, 0]):
         from scipy.spatial import KDTree
@@ -240,7 +256,6 @@ def _filters_of_part(means: Tensor, cameras: Sequence[Camera]) -> tuple[Tensor, 
         angles = np.array([camera.fx * camera.fy for camera in cameras])
         nearest, index = KDTree(np.stack([camera.position for camera in cameras])).query(means[unseen].cpu().numpy())
         mean[unseen] = means.new_tensor(np.maximum(nearest, NEAR) ** 2 / angles[index])
-        least[unseen] = 0
     # Rounding must not make it larger than the pixels of the finest photo itself.
     return (EPS2D * mean).sqrt(), (EPS2D * least).sqrt() * (1 - ROUNDING)
 
@@ -253,14 +268,26 @@ def _pixel_areas(local: Tensor, fx: float, fy: float, is_pinhole: bool) -> Tenso
     return areas / (fx * fy)
 
 
-def _is_shown(local: Tensor, camera: Camera) -> Tensor:
-    """Return whether [N] a camera has positions [N, 3], in its axes, in its picture; occlusion is not considered."""
-    if not camera.is_pinhole:
-        rows = pixels_of_directions(local.double().cpu().numpy(), camera)
-        return torch.from_numpy(np.isfinite(rows).all(axis=1)).to(local.device)
-    x, y, depth = local.unbind(1)
-    columns, rows = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-    return (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height) & (depth > NEAR)
+def _pixels_beyond(local: Tensor, camera: Camera) -> Tensor:
+    """Return how many pixels [N] positions [N, 3], in a camera's axes, are outside of its picture.
+
+    At most 0 within it, infinite where the lens does not look; occlusion is not considered.
+    """
+    if camera.projection == "equirectangular":
+        return local.new_zeros(len(local))
+    width, height = camera.width, camera.height
+    if camera.is_pinhole:
+        x, y, depth = local.unbind(1)
+        columns, rows = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        hidden = depth <= NEAR
+    else:
+        size = {"width": 3 * width, "height": 3 * height, "cx": camera.cx + width, "cy": camera.cy + height}
+        places = pixels_of_directions(local.double().cpu().numpy(), replace(camera, **size))
+        rows, columns = torch.from_numpy(places + 0.5).to(local).unbind(1)
+        rows, columns = rows - height, columns - width
+        hidden = columns.isnan()
+    outside = torch.maximum((columns - width / 2).abs() - width / 2, (rows - height / 2).abs() - height / 2)
+    return outside.masked_fill(hidden | outside.isnan(), math.inf)
 
 
 def keep_light(

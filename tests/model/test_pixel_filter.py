@@ -158,6 +158,27 @@ def test_views_from_where_photos_are_or_farther_stay():
     assert torch.equal(*(field.render(near).hdr for field in compensated))
 
 
+@pytest.mark.parametrize(("camera", "aside"), [(PHOTO, 0.64), (FISHEYE, 0.72)], ids=["pinhole", "fisheye"])
+def test_photos_that_show_a_gaussian_at_their_border_stay(camera, aside):
+    """Its center is outside of the near photo, and inside of the far one."""
+    near, light = replace(camera, world_to_camera=pose_at(-1.0)), []
+    for photos in ([camera, near], [camera], []):
+        field = lamp(photos)
+        places, sizes = torch.tensor([[aside, 0.0, 2.0]]).expand(3, 3), torch.full((3, 3), math.log(0.03))
+        field.gaussians.overwrite({"means": places, "log_scales": sizes})
+        light.append(field.render(near).hdr)
+    assert torch.equal(light[0], light[2]) and light[0].max() > 1
+    assert not torch.equal(light[1], light[2]), "what happens without the near photo"
+
+
+def test_filters_that_a_render_under_autocast_leaves_are_precise():
+    places = torch.tensor([[-0.5, -0.3, 2.0], [0.1, 0.2, 3.0], [9.0, 0.4, 2.5]])
+    moved = [replace(PHOTO, world_to_camera=pose_at(0.1234))]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        filters = photo_filters(places, moved)
+    assert all(map(torch.equal, filters, photo_filters(places, moved)))
+
+
 @pytest.mark.parametrize("scale", [0.5, 2.0, 4.0])
 @pytest.mark.parametrize("camera", [PHOTO, FISHEYE], ids=["pinhole", "fisheye"])
 def test_small_lamps_keep_their_light_at_other_sizes(camera, scale):
