@@ -50,8 +50,8 @@ def rasterize_directions(
 ) -> tuple[Tensor, Tensor]:
     """Blend Gaussians along directions from a place: an environment map, or any picture of the sphere.
 
-    Differentiable with respect to every tensor but the directions, which may not require a gradient. On the CPU
-    gradients repeat bit for bit, whatever the number of threads. Neighboring pixels should look in neighboring
+    Differentiable with respect to every tensor but axes and directions; the latter may not require a gradient. On the
+    CPU gradients repeat bit for bit, whatever the number of threads. Neighboring pixels should look in neighboring
     directions; blocks of 128 x 128 pixels are culled as one.
 
     Args:
@@ -90,6 +90,8 @@ def rasterize_directions(
     )
     if axes is not None:
         check_tensors(means=(means, ("N", 3)), axes=(axes, ("A", 3)))
+        if not len(axes):
+            raise ValueError(f"axes has shape {list(axes.shape)}, expected [A, 3] with at least one axis")
     check_channels(features)
     check_opacities(opacities)
     check_position(position)
@@ -134,8 +136,8 @@ class _SphereSplats(NamedTuple):
 def _depths(splats: _SphereSplats, axes: Tensor) -> Tensor:
     """Return the depths [N] along the nearest of axes [A, 3], at least 0."""
     cosines = torch.zeros_like(splats.distances)
-    for part in axes.split(8):  # Not [N, A] at once
-        cosines = cosines.maximum((splats.caps[:, :3] @ part.T).amax(1))
+    for axis in axes:  # One by one: a matrix product may be in TF32, whose rounding changes the order.
+        cosines = cosines.maximum(splats.caps[:, :3] @ axis)
     return splats.distances * cosines
 
 

@@ -96,6 +96,7 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
         ),
         ("directions", torch.full((2, 2, 3), NAN).double(), ValueError, "directions have lengths from nan to nan"),
         ("axes", torch.eye(3).double()[0], ValueError, r"axes has shape \[3\], expected \[A, 3\]"),
+        ("axes", torch.zeros(0, 3).double(), ValueError, r"axes has shape \[0, 3\], expected .* at least one axis"),
         ("directions", torch.eye(3).double()[None].requires_grad_(), ValueError, r"pass directions\.detach\(\)"),
         (
             "features",
