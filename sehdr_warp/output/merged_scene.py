@@ -45,6 +45,11 @@ class MergedScene(RenderableScene):
             _joined([getattr(scene.field, name) for scene in scenes]) for name in ("confidence", "clipped_stops")
         )
         self.field = on_device(field, first.device)
+        photos = [
+            [move.camera(camera) for camera in scene.field.photo_cameras]
+            for scene, move in zip(scenes, moves, strict=True)
+        ]
+        self.field.photo_cameras = [camera for each in photos for camera in each] if all(photos) else ()
         self.degree = self.field.gaussians.degree
         self._clipped = _joined([scene.clipped_share() for scene in scenes])
 

@@ -195,9 +195,11 @@ class Splats(RenderableScene):
         self.path, self.field, self.cameras, self.world_matrix = path, field, cameras, world_matrix
         self.response, self.base_time, self.degree = field.response, field.base_time, field.gaussians.degree
         self.scene_name = path.stem
-        if (focals := field.photo_focals) is not None:  # Cameras of other focal lengths are not those of the photos.
-            views = [entry.camera for entry in cameras]
-            field.photo_cameras = [view for view in views if focals.variance(view.fx) == EPS2D]
+        views, focals = [entry.camera for entry in cameras], field.photo_focals
+        if focals is not None:  # Cameras of other focal lengths are not those of the photos.
+            views = [view for view in views if focals.variance(view.fx) == EPS2D]
+        if focals is not None or field.antialiased:  # Of compensated opacities, for the order on maps alone
+            field.photo_cameras = views
 
 
 def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Splats:

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.model.baking import field_of
-from sehdr_warp.model.pixel_filter import FocalRange
+from sehdr_warp.model.pixel_filter import FocalRange, photo_axes
 from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.merged_scene import merge_scenes
 from sehdr_warp.runs.run import Splats, load_splats
@@ -137,3 +138,17 @@ def test_views_nearer_than_the_photos_have_all_light_where_cameras_lie_beside(tm
     assert read == pytest.approx(expected, rel=0.01)
     file.with_name("a.ply.cameras.json").unlink()
     assert float(load_splats(file).render(near).hdr.mean()) < 0.7 * expected
+
+
+def test_merged_scenes_keep_their_photos_cameras(tmp_path, run):
+    near, other = camera(96, 72, position=(0, 0, -1.5)), load_splats(export(run, tmp_path / "a.ply", axes="scene"))
+    alone, merged = (float(scene.render(near).hdr.mean()) for scene in (run, merge_scenes(run)))
+    assert merged == pytest.approx(alone, rel=0.01)
+    assert len(merge_scenes(run, run).field.photo_cameras) == 6
+    assert not merge_scenes(run, other).field.photo_cameras, "those of one of them are not known"
+
+
+def test_maps_of_files_with_compensated_opacities_have_the_order_of_the_photos(tmp_path, run):
+    run.field.antialiased, axes = True, photo_axes(run.field)
+    read = load_splats(export(run, tmp_path / "a.ply", axes="scene", cameras=True)).field
+    assert read.antialiased and torch.equal(photo_axes(read), axes) and read.filters is None
