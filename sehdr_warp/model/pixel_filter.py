@@ -157,8 +157,8 @@ def options_of_view(
     if least is not None:
         local = means.detach() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         areas = _pixel_areas(local, fx, fy, camera.directions is None)
-        lacking = (least.square() - variance * areas).nan_to_num(0).clamp_min(0)[:, None]
-        log_scales = torch.logaddexp(2 * log_scales, lacking.log()) / 2  # Unchanged, to the bit, by 0
+        deficits = (least.square() - variance * areas).nan_to_num(0).clamp_min(0)[:, None]
+        log_scales = torch.logaddexp(2 * log_scales, deficits.log()) / 2  # Unchanged, to the bit, by 0
     if variance < EPS2D and camera.directions is None:
         opacities = keep_light(opacities, means, log_scales, quaternions, camera, variance)
     return ViewOptions(log_scales, opacities, max(variance, EPS2D))
@@ -176,7 +176,7 @@ def filters_of(field: Any) -> PhotoFilters | None:
 
     None if neither is known, or if opacities make up for the filter.
     """
-    means, stated = field.gaussians.means.detach(), field.photo_filters
+    means, of_file = field.gaussians.means.detach(), field.photo_filters
     if field.antialiased:
         return None
     filters = None
@@ -184,8 +184,8 @@ def filters_of(field: Any) -> PhotoFilters | None:
         cameras = [field.normalization.camera(camera) for camera in field.photo_cameras]
         sizes = field.gaussians.log_scales.detach().amax(1).exp()
         filters = photo_filters(means, cameras, sizes, field.render_device)
-    if stated is not None:
-        mean = torch.tensor(stated, dtype=torch.float32, device=means.device)
+    if of_file is not None:
+        mean = torch.tensor(of_file, dtype=torch.float32, device=means.device)
         filters = PhotoFilters(mean, filters and filters.least)
     return filters and filters._replace(mean=filters.mean.clamp_min(NEAR))
 
@@ -241,21 +241,21 @@ def _filters_of_part(means: Tensor, sizes: Tensor, cameras: Sequence[Camera]) ->
         pose = means.new_tensor(camera.world_to_camera)
         local = means @ pose[:3, :3].T + pose[:3, 3]
         areas, beyond = _pixel_areas(local, camera.fx, camera.fy, camera.is_pinhole), _pixels_beyond(local, camera)
-        shown = (beyond <= 0) & (areas < math.inf)
-        logarithms += areas.log().masked_fill_(~shown, 0)
-        count += shown
+        visible = (beyond <= 0) & (areas < math.inf)
+        logarithms += areas.log().masked_fill_(~visible, 0)
+        count += visible
         # Along the radius, a pinhole's picture is enlarged by more.
         tilts = local.norm(dim=1) / local[:, 2].clamp_min(NEAR) if camera.is_pinhole else 1.0
         reach = REACH * (sizes.square() / areas * tilts + EPS2D).sqrt()
         least = least.minimum(areas.masked_fill(~(beyond <= reach), math.inf))
     least = least.masked_fill(least == math.inf, 0)
     mean = (logarithms / count.clamp_min(1)).exp()
-    if len(unseen := (count == 0).nonzero()[:, 0]):
+    if len(elsewhere := (count == 0).nonzero()[:, 0]):
         from scipy.spatial import KDTree
 
         angles = np.array([camera.fx * camera.fy for camera in cameras])
-        nearest, index = KDTree(np.stack([camera.position for camera in cameras])).query(means[unseen].cpu().numpy())
-        mean[unseen] = means.new_tensor(np.maximum(nearest, NEAR) ** 2 / angles[index])
+        nearest, index = KDTree(np.stack([camera.position for camera in cameras])).query(means[elsewhere].cpu().numpy())
+        mean[elsewhere] = means.new_tensor(np.maximum(nearest, NEAR) ** 2 / angles[index])
     # Rounding must not make it larger than the pixels of the finest photo itself.
     return (EPS2D * mean).sqrt(), (EPS2D * least).sqrt() * (1 - ROUNDING)
 

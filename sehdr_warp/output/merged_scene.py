@@ -75,14 +75,14 @@ def merge_scenes(run: RenderableScene, *others: RenderableScene) -> MergedScene:
     """
     refuse_paths("load_run", run, *others)
     for other in others:
-        if _placed_apart(run, other):
+        if _have_own_worlds(run, other):
             problem = "were found apart, so their coordinates differ, and the scenes do not fit together"
             remedy = "train both with cameras of one set, as of COLMAP"
             log.warning("%s: its cameras and those of %s %s; %s", other.path, run.path, problem, remedy)
     return MergedScene((run, *others))
 
 
-def _placed_apart(first: RenderableScene, second: RenderableScene) -> bool:
+def _have_own_worlds(first: RenderableScene, second: RenderableScene) -> bool:
     """Return whether structure from motion placed the photos of each scene, and none of them alike in both."""
     placed, others = (
         {entry.placed.file: entry.placed.world_to_camera for entry in scene.cameras if entry.placed is not None}

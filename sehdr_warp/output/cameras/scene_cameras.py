@@ -29,8 +29,8 @@ def split_or_all(run: "RenderableScene", split: str) -> list[Camera]:
     return [entry.camera for entry in run.cameras if entry.split == split] or [entry.camera for entry in run.cameras]
 
 
-def view_named(run: "RenderableScene", name: str) -> "CameraEntry":
-    """Return a view by its name, or by the file name of its photo; raise SehdrError if the scene has none of it."""
+def find_view(run: "RenderableScene", name: str) -> "CameraEntry":
+    """Return the view of a name, or of the file name of its photo; raise SehdrError if the scene has none."""
     views = {entry.name: entry for entry in run.cameras}
     if not views:
         remedy = "give a run, or keep what `export --cameras` writes beside a file"

@@ -17,7 +17,7 @@ from ...splats import cameras_beside
 from ..world_transform import WorldTransform, photos_to_scene, world_transform
 from .framing import default_path, widescreen_camera
 from .paths import interpolate
-from .scene_cameras import training_cameras, view_named
+from .scene_cameras import find_view, training_cameras
 
 if TYPE_CHECKING:
     from ...runs.run import RenderableScene
@@ -60,7 +60,7 @@ def select_cameras(
     if camera is not None and text in PATHS:
         raise SehdrError(f"--camera {camera}: chooses a photo or from a file of cameras, which --cameras {text} is not")
     if text in SPLITS and camera is not None:
-        entry = view_named(run, camera)
+        entry = find_view(run, camera)
         views = [(entry.name, entry.camera)]
     elif text in SPLITS:
         views = [(entry.name, entry.camera) for entry in run.cameras if text in (entry.split, "all")]

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...errors import SehdrError
 from ...scene.camera_focus import MapCenter, map_center
-from ..cameras.scene_cameras import training_cameras, view_named
+from ..cameras.scene_cameras import find_view, training_cameras
 from ..world_transform import WorldTransform
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def find_center(
             raise SehdrError("the scene has no cameras, so no center; say where with --at x,y,z")
         center = map_center(photos)
     elif isinstance(at, str) and at.startswith("camera:"):
-        center = MapCenter(view_named(run, at.removeprefix("camera:")).camera.position, 0.0)
+        center = MapCenter(find_view(run, at.removeprefix("camera:")).camera.position, 0.0)
     else:
         center = MapCenter(transform.inverse().points(_numbers(at)), 0.0)
     if beyond is not None:

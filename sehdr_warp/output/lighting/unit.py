@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import InputError, SehdrError, refuse_paths
 from ...files import read_json, write_json
 from ...runs.values import LIGHT_UNIT_FILE
-from ..cameras.scene_cameras import view_named
+from ..cameras.scene_cameras import find_view
 from ..images.tonemap import LUMINANCE
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def meter(
         SehdrError: For a view or place that is not there, or values that cannot be.
     """
     refuse_paths("load_run", run)
-    entry, (x, y) = view_named(run, view), pixel
+    entry, (x, y) = find_view(run, view), pixel
     view, camera = entry.name, entry.camera
     if (luminance is None) == (illuminance is None):
         raise SehdrError("a reading is one of luminance, in cd/m^2, and illuminance, in lux")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.cameras.scene_cameras import view_named
+from sehdr_warp.output.cameras.scene_cameras import find_view
 from sehdr_warp.output.cameras.selection import select_cameras
 
 from ..helpers import AnalyticRun, Entry, camera, sees
@@ -33,7 +33,7 @@ def test_orbit_of_parallel_cameras_uses_the_depth_seen():
 def test_a_view_is_named_as_the_file_of_its_photo(view, photo):
     """macOS writes an accent as a letter of its own, which names of views have as `_`."""
     run = AnalyticRun(((view, "train"), ("other", "test")))
-    assert view_named(run, photo) is view_named(run, view) is run.cameras[0]
+    assert find_view(run, photo) is find_view(run, view) is run.cameras[0]
     assert [name for name, _ in select_cameras(run, "test", camera=photo)] == [view]
     with pytest.raises(SehdrError, match="is not one of the scene's"):
-        view_named(run, f"x{photo}")
+        find_view(run, f"x{photo}")
