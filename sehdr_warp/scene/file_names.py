@@ -248,10 +248,11 @@ def _plain(name: str) -> str:
 
 
 def view_names_of(file_name: str) -> list[str]:
-    """Return the names that a view may have by the file name of its photo, with or without suffix."""
+    """Return the names that a view may have by the file name of its photo, likeliest first, with or without suffix."""
     path = Path(file_name)
-    stem = path.stem if path.suffix.lower() in PHOTO_SUFFIXES else file_name
-    return [_plain(unicodedata.normalize(form, stem)) for form in ("NFC", "NFD")]
+    stem, folder = path.stem if path.suffix.lower() in PHOTO_SUFFIXES else path.name, path.parent.name
+    names = [_plain(unicodedata.normalize(form, stem)) for form in ("NFC", "NFD")]
+    return [f"{folder}_{name}" for name in names if folder] + names  # As of unique_names()
 
 
 def unique_names(records: Sequence[ImageRecord]) -> list[str]:

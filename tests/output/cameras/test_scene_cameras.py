@@ -37,3 +37,10 @@ def test_a_view_is_named_as_the_file_of_its_photo(view, photo):
     assert [name for name, _ in select_cameras(run, "test", camera=photo)] == [view]
     with pytest.raises(SehdrError, match="is not one of the scene's"):
         find_view(run, f"x{photo}")
+
+
+def test_photos_of_one_name_are_told_apart_by_their_folders():
+    """A test view keeps the name that it shares, and others get their folder in front."""
+    run = AnalyticRun((("r_0", "test"), ("train_r_0", "train")))
+    assert find_view(run, "scene/train/r_0.png").name == "train_r_0"
+    assert find_view(run, "test/r_0.png").name == find_view(run, "r_0.png").name == "r_0"
