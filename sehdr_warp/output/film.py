@@ -142,14 +142,14 @@ def write_film(
 
 def _check_options(cameras: Sequence[Camera], transfer: str, ev_ramp: tuple[float, float]) -> None:
     """Raise for what no film can be made of; `cameras` may be something else than the annotation says."""
-    if isinstance(cameras, Camera) or not len(cameras):
+    if not isinstance(cameras, Sequence) or not cameras:
         raise SehdrError(f"cameras: {cameras or 'none'}; a film has a list of Cameras, one for each frame")
     for camera in cameras:
         require_camera(camera)
     if transfer not in TRANSFERS:
         hint = did_you_mean(transfer, TRANSFERS)
         raise SehdrError(f"transfer {transfer!r} is not one of {', '.join(TRANSFERS)}{hint}")
-    if len(ev_ramp) != 2 or not np.isfinite(ev_ramp).all():
+    if np.shape(ev_ramp) != (2,) or not np.isfinite(ev_ramp).all():
         raise SehdrError(f"ev_ramp {ev_ramp} is not two numbers of stops, of the first and the last frame")
 
 

@@ -91,7 +91,7 @@ class Camera:
         pose = np.array(self.world_to_camera, dtype=np.float64)
         pose.setflags(write=False)
         object.__setattr__(self, "world_to_camera", pose)
-        if (self.width, self.height) != (int(self.width), int(self.height)):
+        if self.width % 1 or self.height % 1:  # True for NaN and infinity, too
             raise ValueError(f"image size {self.width} x {self.height} is not in whole pixels")
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))

@@ -159,6 +159,8 @@ write_film(AnalyticRun(), {str(tmp_path / "f.mkv")!r}, cameras[:{count}], transf
         ({"transfer": "hdr"}, "transfer 'hdr' is not one of sdr, hlg, .*, did you mean hdr10?"),
         ({"ev_ramp": (0.0, float("nan"))}, r"ev_ramp \(0.0, nan\) is not two numbers of stops"),
         ({"ev_ramp": (1.0,)}, "is not two numbers of stops"),
+        ({"ev_ramp": 1.0}, "ev_ramp 1.0 is not two numbers of stops"),
+        ({"cameras": iter(())}, "cameras: <tuple_iterator .*; a film has a list of Cameras"),
     ],
 )
 def test_what_is_no_film_is_named(tmp_path, changes, message):

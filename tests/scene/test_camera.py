@@ -17,6 +17,7 @@ from sehdr_warp.scene.camera import limited_size
         ({"cx": np.nan}, "not finite"),
         ({"width": 0}, "not positive"),
         ({"width": 4.5}, "4.5 x 6 is not in whole pixels"),
+        ({"width": np.inf}, "inf x 6 is not in whole pixels"),
         ({"width": 1 << 21}, "more than 1048576 pixels"),
         ({"world_to_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "not a proper rotation"),
         ({"world_to_camera": np.eye(3)}, "4 x 4"),
