@@ -108,9 +108,9 @@ def photo_axes(field: Any) -> Tensor | None:
     What is behind others in all photos is not constrained, and may be in front of them in order of distance: those of
     some of the photos, and of a cube. None without photos, or if some are wide, which order by distance.
     """
-    cameras = every_nth(field.photo_cameras, MOST_AXES)
-    if not cameras or not all(camera.is_pinhole for camera in cameras):
+    if not field.photo_cameras or not all(camera.is_pinhole for camera in field.photo_cameras):
         return None
+    cameras = every_nth(field.photo_cameras, MOST_AXES)
     cube = cameras[len(cameras) // 2].world_to_camera[:3, :3]
     axes = np.concatenate([[camera.world_to_camera[2, :3] for camera in cameras], cube, -cube])
     return torch.tensor(axes, dtype=torch.float32, device=field.gaussians.means.device)

@@ -121,7 +121,7 @@ def test_a_map_hides_what_photos_hide():
     )
     field.gaussians.harmonics_dc.data = colors[:, None, None].expand(3, 1, 3) / 0.28209479
     light = []
-    for cameras in ([PHOTO], [], [PHOTO, FISHEYE]):
+    for cameras in ([PHOTO], [], [PHOTO, FISHEYE, *[PHOTO] * 40]):
         vars(field).pop("filters", None)
         field.photo_cameras = cameras
         light.append(float(field.render_directions(np.zeros(3), rays, focal_length=40.0, pixel_angle=0.01).hdr.mean()))
