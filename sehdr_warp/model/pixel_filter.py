@@ -26,8 +26,9 @@ from .renders import CameraTensors
 
 ROUNDING = 1e-3  # Sizes are whole pixels, so focal lengths of one resolution differ by this.
 TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no finer samples.
-MOST_CAMERAS = 128
-"""Of those that a CPU looks at: a pinhole takes 0.06 seconds for a million Gaussians, a fisheye 0.1 on any device."""
+MOST_CAMERAS, MOST_PROJECTIONS = 128, 1 << 27
+"""Cameras that a CPU looks at, or as many as project no more Gaussians in all: with a pinhole, a million of these take
+0.06 seconds, with a fisheye 0.1 on any device."""
 MOST_AXES = 32
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
 ROWS, ROWS_GPU = 1 << 17, 1 << 20  # Gaussians that are projected at once: each takes 100 bytes meanwhile.
@@ -215,13 +216,13 @@ def photo_filters(
 
     Args:
         means: [N, 3] in the cameras' coordinates.
-        cameras: Training cameras, one or more; of more than MOST_CAMERAS, a CPU looks at a part.
+        cameras: Training cameras, one or more; of many, a CPU looks at a part, see MOST_CAMERAS.
         sizes: [N] largest standard deviations, by default those of points.
         device: To compute on, by default that of the means.
     """
     device = torch.device(device or means.device)
     if device.type == "cpu" or not all(camera.is_pinhole for camera in cameras):
-        cameras = every_nth(cameras, MOST_CAMERAS)
+        cameras = every_nth(cameras, max(MOST_CAMERAS, MOST_PROJECTIONS // max(len(means), 1)))
     rows = ROWS if device.type == "cpu" else ROWS_GPU
     sizes = torch.zeros_like(means[:, 0]) if sizes is None else sizes
     with torch.autocast(device.type, enabled=False):  # They are kept for later renders.

@@ -179,6 +179,15 @@ def test_filters_that_a_render_under_autocast_leaves_are_precise():
     assert all(map(torch.equal, filters, photo_filters(places, moved)))
 
 
+def test_all_photos_count_if_gaussians_are_few(monkeypatch):
+    far, near = (replace(PHOTO, world_to_camera=pose_at(depth)) for depth in (8.0, 2.0))
+    photos, places = [far, near, *[far] * 200], np.zeros((3, 3))
+    pixel = (1 - ROUNDING) * math.sqrt(EPS2D) / 40
+    np.testing.assert_allclose(filters_at(places, photos).least, 2 * pixel, rtol=1e-6)
+    monkeypatch.setattr(pixel_filter, "MOST_PROJECTIONS", 300)
+    np.testing.assert_allclose(filters_at(places, photos).least, 8 * pixel, rtol=1e-6)
+
+
 @pytest.mark.parametrize("scale", [0.5, 2.0, 4.0])
 @pytest.mark.parametrize("camera", [PHOTO, FISHEYE], ids=["pinhole", "fisheye"])
 def test_small_lamps_keep_their_light_at_other_sizes(camera, scale):
