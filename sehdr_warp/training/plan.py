@@ -124,7 +124,7 @@ class Plan:
             if (dark := self.facts.clipped_when_dark) < self.facts.clipped:
                 remedy = f"the darkest photos clip, too ({dark:.1%} of their pixels): {remedy}"
             lines.append(f"plan: {estimated}; {remedy}")
-        return lines + [f"plan: {line}, as you set it" for line in _format_fields(self.user_fields)]
+        return lines + [f"plan: {line}, as it was set" for line in _format_fields(self.user_fields)]
 
 
 def _format_fields(fields: dict) -> list[str]:
