@@ -27,6 +27,7 @@ from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
 from sehdr_warp.rasterizer.reference import project_reference
 from sehdr_warp.response import response_by_name
+from sehdr_warp.scene.wide_camera import pixels_of_directions
 
 from ..refusals import call
 
@@ -261,9 +262,13 @@ def test_fisheye_photos_have_no_part_in_filters_of_what_is_behind_them(distortio
 def test_filters_are_computed_a_part_at_a_time(monkeypatch):
     places = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + np.array([0, 0, 1.5])
     whole, sizes = filters_at(places, [PHOTO, FISHEYE]), []
-    part = pixel_filter._filters_of_part
+
+    def project(directions, camera):
+        sizes.append(len(directions))
+        return pixels_of_directions(directions, camera)
+
     monkeypatch.setattr(pixel_filter, "ROWS", 8)
-    monkeypatch.setattr(pixel_filter, "_filters_of_part", lambda *rest: sizes.append(len(rest[0])) or part(*rest))
+    monkeypatch.setattr(pixel_filter, "pixels_of_directions", project)
     for one, other in zip(whole, filters_at(places, [PHOTO, FISHEYE]), strict=True):
         torch.testing.assert_close(one, other)
     assert sizes == [8, 8, 4]
