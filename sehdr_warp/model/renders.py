@@ -113,7 +113,7 @@ class CameraTensors:
 
 def require_time(time: object) -> None:
     """Raise ValueError for an exposure time that is not a positive number."""
-    if not isinstance(time, Real) or not 0 < time < math.inf:
+    if not isinstance(time, Real) or not 0 < float(time) < math.inf:
         raise ValueError(f"exposure_time is {time!r}, expected seconds, such as 1 / 125")
 
 
