@@ -29,7 +29,7 @@ TOLERANCE = 0.05  # A render that is coarser than the photos by less needs no fi
 MOST_CAMERAS, MOST_PROJECTIONS = 128, 1 << 27
 """Cameras that a CPU looks at, or as many as project no more Gaussians in all: with a pinhole, a million of these take
 0.06 seconds, with a fisheye 0.1 on any device."""
-MOST_AXES = 32
+MOST_AXES = 32  # Photos by whose axes maps order Gaussians
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
 ROWS, ROWS_GPU = 1 << 17, 1 << 20  # Gaussians that are projected at once: each takes 100 bytes meanwhile.
 NO_PIXEL = 1e6  # Pixels: the focal length of cameras whose pixels have next to no size
@@ -137,7 +137,7 @@ class ViewOptions(NamedTuple):
 
 
 def options_of_view(
-    field: Any, camera: CameraTensors, shapes: tuple[Tensor, Tensor, Tensor], opacities: Tensor
+    field: Any, camera: CameraTensors, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacities: Tensor
 ) -> ViewOptions:
     """Return arguments with which a view of any resolution, from any place, has the light of the photos.
 
@@ -146,10 +146,11 @@ def options_of_view(
     Args:
         field: A RadianceField.
         camera: Of the view.
-        shapes: Means, log_scales and quaternions of the Gaussians.
-        opacities: [N] of these.
+        means: [N, 3] of the Gaussians.
+        log_scales: [N, 3].
+        quaternions: [N, 4], w first.
+        opacities: [N].
     """
-    means, log_scales, quaternions = shapes
     if field.photo_focals is None or field.antialiased:  # Which keeps the light at every resolution
         return ViewOptions(log_scales, opacities, EPS2D)
     fx, fy = camera.intrinsics[:2].tolist()

@@ -346,7 +346,7 @@ class RadianceField(nn.Module):
         if opacities is None:
             means, log_scales, quaternions = means.detach(), log_scales.detach(), quaternions.detach()
             opacities = gaussians.opacities().detach()
-        log_scales, opacities, eps2d = options_of_view(self, camera, (means, log_scales, quaternions), opacities)
+        log_scales, opacities, eps2d = options_of_view(self, camera, means, log_scales, quaternions, opacities)
         shapes = means, log_scales, quaternions
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities, at_place)

@@ -6,7 +6,7 @@ darker photos, which measure the light, and harmonics would give it other light 
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -30,6 +30,13 @@ LARGEST_RATIO = 16.0  # By which measured light may differ from the scene's at o
 DEVIATION = 0.25 * math.log(2)  # Of the natural logarithm of measured light
 CERTAIN = 2.0
 """Light of a file that is so many times as certain as what is measured stays if both differ by fewer DEVIATIONs."""
+
+
+class MeasuredRadiance(NamedTuple):
+    """What darker views measure of each Gaussian, by channel."""
+
+    radiance: Tensor  # [N, 3]
+    is_known: Tensor  # bool [N, 3]
 
 
 def are_measured(views: Sequence[View]) -> bool:
@@ -65,17 +72,17 @@ def measured_estimates(
     """
     longest = max(view.exposure_time for view in views)
     darker = [view.exposure_time <= DARKER * longest for view in views]
-    radiance, measured = _measured_radiance(field, views, darker, degree)
+    light = _measured_radiance(field, views, darker, degree)
     return [
-        _replace(field, view, estimate, radiance, measured, degree) if estimate.any() else estimate
+        _replace(field, view, estimate, light, degree) if estimate.any() else estimate
         for view, estimate in zip(views, estimates, strict=True)
     ]
 
 
 def _measured_radiance(
     field: RadianceField, views: Sequence[View], darker: Sequence[bool], degree: int
-) -> tuple[Tensor, Tensor]:
-    """Return the radiance [N, 3] that darker views measure, and whether [N, 3] they do. Pixels count by their masks."""
+) -> MeasuredRadiance:
+    """Return what darker views measure. Pixels count by their masks."""
     device, count = field.gaussians.means.device, field.gaussians.count
     light, weights, others, every = (torch.zeros(count, size, device=device) for size in (3, 3, 1, 1))
     for view, dark in zip(views, darker, strict=True):
@@ -97,17 +104,15 @@ def _measured_radiance(
         weights += sums[:, 3:6]
         every += sums[:, 6:]
     usual = others * (sum(darker) / (len(darker) - sum(darker)))
-    measured = (weights > LEAST_PIXELS) & (weights > every / 2) & (weights > LEAST_PART * usual)
-    return light / weights.clamp_min(1e-12), measured
+    is_known = (weights > LEAST_PIXELS) & (weights > every / 2) & (weights > LEAST_PART * usual)
+    return MeasuredRadiance(light / weights.clamp_min(1e-12), is_known)
 
 
-def _replace(
-    field: RadianceField, view: View, estimate: Tensor, radiance: Tensor, measured: Tensor, degree: int
-) -> Tensor:
+def _replace(field: RadianceField, view: View, estimate: Tensor, light: MeasuredRadiance, degree: int) -> Tensor:
     """Return the estimates [h, w, 6] of a view, replaced where most of its light is of measured Gaussians."""
     own = field.radiance_towards(view.camera.position, degree=degree)
-    part = torch.where(measured, radiance, 0)
-    whole = field.render_values(view.camera, torch.where(measured, radiance, own))
+    part = torch.where(light.is_known, light.radiance, 0)
+    whole = field.render_values(view.camera, torch.where(light.is_known, light.radiance, own))
     is_known = field.render_values(view.camera, part) > LEAST_SHARE * whole
     clipped = torch.tensor(view.codes >= view.levels, device=whole.device)
     logarithm = (whole * (view.exposure_time / field.response.white)).clamp_min(1).log()

@@ -102,7 +102,7 @@ def exif_texts(*values: Any) -> tuple[str, ...]:
 
 def are_camera_files(sources: Sequence[Path | None]) -> bool:
     """Return whether most of the files are JPEG or HEIC of a camera: their EXIF states an exposure time or f-number."""
-    kinds = (*JPEG_SUFFIXES, *HEIF_SUFFIXES)
+    kinds = JPEG_SUFFIXES + HEIF_SUFFIXES
     photos = (path for path in sources if path and path.suffix.lower() in kinds and path.is_file())
     exposures = [exif_exposure(photo) for photo in photos]
     return 2 * sum(bool(exposure.time or exposure.f_number) for exposure in exposures) > len(sources)
