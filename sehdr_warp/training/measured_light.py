@@ -33,7 +33,7 @@ CERTAIN = 2.0
 
 
 class MeasuredRadiance(NamedTuple):
-    """What darker views measure of each Gaussian, by channel."""
+    """Light of each Gaussian that darker views measure, by channel."""
 
     radiance: Tensor  # [N, 3]
     is_known: Tensor  # bool [N, 3]
