@@ -21,7 +21,8 @@ from .geometry import geometry, matrix
 def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool, own_cameras: bool):
     """Return the projection kernel for one scalar type.
 
-    The kernel's `visibility` is the forward pass's extents in the adjoint, and None in the forward pass.
+    The kernel's `visibility` is the forward pass's extents in the adjoint, and None in the forward pass. Its `limit_x`
+    and `limit_y` are the largest x/z and y/z at which it linearizes the perspective, infinite for that of the image.
 
     antialiased: lower the opacity by sqrt(det / det_blurred), so that the blur by eps2d keeps a Gaussian's energy (Yu
     et al. 2024, Mip-Splatting). differentiate_compensation: differentiate that factor with respect to the covariance,
@@ -59,7 +60,7 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
         opacities: wp.array(dtype=real), world_to_camera: wp.array(dtype=mat44),
         intrinsics: wp.array(dtype=vec4),
         width: int, height: int, near_plane: real, eps2d: real, alpha_threshold: real,
-        visibility: wp.array(dtype=vec2),
+        limit_x: real, limit_y: real, visibility: wp.array(dtype=vec2),
         # outputs
         means2d: wp.array(dtype=vec2), conics: wp.array(dtype=vec3), depths: wp.array(dtype=real),
         opacities2d: wp.array(dtype=real), extents: wp.array(dtype=vec2),
@@ -88,7 +89,7 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
         y_ratio = wp.where(in_front, center[1], real(0.0)) * inverse_z
         pixel = vec2(fx * x_ratio + pinhole[2], fy * y_ratio + pinhole[3])
 
-        # Far off the axis the linearization explodes: hold its ray near the frustum.
+        # Far off the axis the linearization explodes: hold its ray near the frustum, and within the limits.
         w = real(width)
         h = real(height)
         margin = real(FRUSTUM_MARGIN)
@@ -98,6 +99,8 @@ def projection_kernel(dtype, antialiased: bool, differentiate_compensation: bool
         ray_y = wp.clamp(
             y_ratio, -(pinhole[3] + margin * h * real(0.5)) / fy, (h - pinhole[3] + margin * h * real(0.5)) / fy
         )
+        ray_x = wp.clamp(ray_x, -limit_x, limit_x)
+        ray_y = wp.clamp(ray_y, -limit_y, limit_y)
         jacobian = mat23(
             fx * inverse_z, real(0.0), -fx * ray_x * inverse_z,
             real(0.0), fy * inverse_z, -fy * ray_y * inverse_z,

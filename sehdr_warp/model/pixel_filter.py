@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..rasterizer.projection import FRUSTUM_MARGIN
 from ..rasterizer.render_options import EPS2D
 from ..scene import Camera
 from ..scene.camera import require_camera
@@ -134,6 +135,29 @@ class ViewOptions(NamedTuple):
     log_scales: Tensor  # [N, 3]
     opacities: Tensor  # [N]
     eps2d: float  # Square pixels
+    ray_limit_x: float
+    ray_limit_y: float
+
+
+class RayLimits(NamedTuple):
+    """Largest x/z and y/z at which the rasterizer linearizes the perspective of any photo, infinite without photos."""
+
+    x: float
+    y: float
+
+    @staticmethod
+    def of(cameras: Iterable[Camera]) -> "RayLimits":
+        """Return the limits of the cameras that are pinholes."""
+        pinholes = [camera for camera in cameras if camera.is_pinhole]
+        if not pinholes:
+            return RayLimits(math.inf, math.inf)
+        sides = [
+            (max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy, c.width / c.fx, c.height / c.fy)
+            for c in pinholes
+        ]
+        x, y, width, height = np.transpose(sides)
+        x, y = x + FRUSTUM_MARGIN * width / 2, y + FRUSTUM_MARGIN * height / 2
+        return RayLimits(*((1 + ROUNDING) * float(limits.max()) for limits in (x, y)))
 
 
 def options_of_view(
@@ -141,7 +165,9 @@ def options_of_view(
 ) -> ViewOptions:
     """Return arguments with which a view of any resolution, from any place, has the light of the photos.
 
-    Gaussians that the view resolves finer than every photo are enlarged: they are filtered as in the finest photo.
+    Gaussians that the view resolves finer than every photo are enlarged: they are filtered as in the finest photo. In a
+    view that is wider than all photos, those beside what a photo shows are linearized as in the photos, which were
+    trained to be right with it: linearized at their own rays, they would reach into its middle.
 
     Args:
         field: A RadianceField.
@@ -151,8 +177,9 @@ def options_of_view(
         quaternions: [N, 4], w first.
         opacities: [N].
     """
+    limits = field.ray_limits if field.photo_cameras else RayLimits.of(())
     if field.photo_focals is None or field.antialiased:  # Which keeps the light at every resolution
-        return ViewOptions(log_scales, opacities, EPS2D)
+        return ViewOptions(log_scales, opacities, EPS2D, *limits)
     fx, fy = camera.intrinsics[:2].tolist()
     variance = field.photo_focals.variance(fx)
     least = None if field.filters is None else field.filters.least
@@ -163,7 +190,7 @@ def options_of_view(
         log_scales = torch.logaddexp(2 * log_scales, deficits.log()) / 2  # Unchanged, to the bit, by 0
     if variance < EPS2D and camera.directions is None:
         opacities = keep_light(opacities, means, log_scales, quaternions, camera, variance)
-    return ViewOptions(log_scales, opacities, max(variance, EPS2D))
+    return ViewOptions(log_scales, opacities, max(variance, EPS2D), *limits)
 
 
 class PhotoFilters(NamedTuple):

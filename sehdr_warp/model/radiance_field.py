@@ -22,7 +22,15 @@ from ..scene.normalization import Normalization
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
-from .pixel_filter import FocalRange, PhotoFilters, filters_of, options_at_place, options_of_view, wide_options
+from .pixel_filter import (
+    FocalRange,
+    PhotoFilters,
+    RayLimits,
+    filters_of,
+    options_at_place,
+    options_of_view,
+    wide_options,
+)
 from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, unpremultiply
 
 NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
@@ -97,6 +105,11 @@ class RadianceField(nn.Module):
     def filters(self) -> PhotoFilters | None:
         """The photos' filter at each Gaussian, as of filters_of(); the Gaussians must not move any more."""
         return filters_of(self)
+
+    @cached_property
+    def ray_limits(self) -> RayLimits:
+        """Rays up to which views are linearized."""
+        return RayLimits.of(self.photo_cameras)
 
     def camera_tensors(self, camera: Camera) -> CameraTensors:
         """Return a camera of scene coordinates in those of the Gaussians, on their device."""
@@ -227,8 +240,7 @@ class RadianceField(nn.Module):
             shares: [N] in [0, 1], of each Gaussian's light, such as the clipped share.
         """
         gaussians = self.gaussians
-        origin = self.normalization.points(position)
-        origin = torch.tensor(origin, dtype=torch.float32, device=gaussians.means.device)
+        origin = torch.tensor(self.normalization.points(position), dtype=torch.float32, device=self.render_device)
         colors = self._blended_colors(origin, degree)
         for index in without:
             colors = colors.index_fill(0, index, 0.0)
@@ -261,9 +273,8 @@ class RadianceField(nn.Module):
     @without_replays()
     def render_ldr(self, camera: Camera, exposure_time: float | None = None, *, degree: int | None = None) -> Tensor:
         """Render the simulated photo [H, W, 3] in [0, 1] of exposure_time seconds, by default the base time."""
-        tensors = self.camera_tensors(camera)
         time = self.base_time if exposure_time is None else exposure_time
-        photo = self.render_photo(tensors, time, degree=degree).encoded
+        photo = self.render_photo(self.camera_tensors(camera), time, degree=degree).encoded
         assert photo is not None
         return photo.clamp(0, 1)
 
@@ -346,19 +357,17 @@ class RadianceField(nn.Module):
         if opacities is None:
             means, log_scales, quaternions = means.detach(), log_scales.detach(), quaternions.detach()
             opacities = gaussians.opacities().detach()
-        log_scales, opacities, eps2d = options_of_view(self, camera, means, log_scales, quaternions, opacities)
-        shapes = means, log_scales, quaternions
+        view = options_of_view(self, camera, means, log_scales, quaternions, opacities)
+        shapes, opacities = (means, view.log_scales, quaternions), view.opacities
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities, at_place)
+        lens = camera.world_to_camera, camera.intrinsics, camera.width, camera.height
+        arguments = means, view.log_scales, quaternions, opacities, features, *lens
         return self.rasterizer(  # rasterize(), see the class
-            *shapes,
-            opacities,
-            features,
-            camera.world_to_camera,
-            camera.intrinsics,
-            camera.width,
-            camera.height,
-            eps2d=eps2d,
+            *arguments,
+            eps2d=view.eps2d,
+            ray_limit_x=view.ray_limit_x,
+            ray_limit_y=view.ray_limit_y,
             antialiased=self.antialiased,
             max_intersections=max_intersections,
             deterministic=self.deterministic,
@@ -378,7 +387,6 @@ class RadianceField(nn.Module):
         shapes: means, log_scales and quaternions.
         """
         means, log_scales, quaternions = shapes
-        options = wide_options(self, camera, log_scales, opacities, at_place)
         image, transmittance = rasterize_directions(
             means,
             quaternions=quaternions,
@@ -386,7 +394,7 @@ class RadianceField(nn.Module):
             position=camera.position,
             directions=directions,
             antialiased=self.antialiased,
-            **options._asdict(),
+            **wide_options(self, camera, log_scales, opacities, at_place)._asdict(),
         )
         none = features.new_zeros(len(features), 2)
         return Rendering(image, transmittance, none, none[:, 0], none, 0)

@@ -31,6 +31,7 @@ from .world_transform import WorldTransform, world_transform
 log = logging.getLogger(__name__)
 _HALF = float(np.finfo(np.float16).max)
 _ANY_FOCALS = 0.0, 1e9  # Pixels; if those of the photos are not known, every picture is filtered like a photo
+_ANY_RAY = 1e9  # Without photos; JSON has no infinity.
 
 
 def write_scene_page(
@@ -94,6 +95,7 @@ def write_scene_page(
         "columns": list(columns),
         "near": NEAR_PLANE * run.field.normalization.unit,
         "margin": FRUSTUM_MARGIN,
+        "rays": [min(limit, _ANY_RAY) for limit in run.field.ray_limits],
         "eps2d": EPS2D,
         "photo_eps2d": 0 if run.field.antialiased else EPS2D,
         "focals": run.field.photo_focals or _ANY_FOCALS,

@@ -121,7 +121,7 @@ def _fake_rasterize(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
 _rasterize_op = register_custom_op(
     "rasterize",  # The fields of RenderOptions, in their order.
     ", SymInt width, SymInt height, float near_plane, float eps2d, float alpha_threshold, bool antialiased, "
-    "bool depth, SymInt? max_intersections, bool deterministic",
+    "bool depth, SymInt? max_intersections, bool deterministic, float ray_limit_x, float ray_limit_y",
     _run_rasterize,
     _fake_rasterize,
 )

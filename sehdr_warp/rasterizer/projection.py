@@ -105,7 +105,8 @@ def adds_in_any_order(device: torch.device) -> bool:
 
 def projection_parameters(options: RenderOptions) -> tuple:
     """Return the parameters of the projection kernel that are not tensors, in its order."""
-    return options.width, options.height, options.near_plane, options.eps2d, options.alpha_threshold
+    sizes = options.width, options.height, options.near_plane, options.eps2d, options.alpha_threshold
+    return *sizes, options.ray_limit_x, options.ray_limit_y
 
 
 def launch_projection(

@@ -7,6 +7,7 @@ tile (tile_lists.py), and blends the lists (blending.py).
 On a GPU, a call like earlier ones is replayed as a CUDA graph instead (_begin_replay() and cuda_graphs/).
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -99,6 +100,8 @@ def rasterize(
     depth: bool = False,
     max_intersections: int | None = None,
     deterministic: bool = False,
+    ray_limit_x: float = math.inf,
+    ray_limit_y: float = math.inf,
 ) -> Rendering:
     """Rasterize Gaussians with any number of feature channels to images of cameras (3DGS, Kerbl et al. 2023).
 
@@ -134,6 +137,10 @@ def rasterize(
             whether there were more.
         deterministic: on a GPU, sum the blend's gradients in a fixed order, as all others are, so that the same input
             gives the same bits. Slower, and the gradients of every intersection take memory.
+        ray_limit_x: largest x/z at which the perspective is linearized; > 0. By default that of rays 30 % of half an
+            image beyond its border, as in 3DGS. For an image that is wider than those that the Gaussians were trained
+            on, the limit of these keeps Gaussians beside them from reaching into the middle.
+        ray_limit_y: likewise y/z.
 
     Raises:
         TypeError: if an argument is not a tensor or not an integer.
@@ -144,8 +151,9 @@ def rasterize(
         RuntimeError: while a CUDA graph is captured without max_intersections.
         OutOfMemory: (a SehdrError) with the sizes, if memory does not suffice.
     """
+    rays = ray_limit_x, ray_limit_y
     options = RenderOptions(
-        width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic
+        width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic, *rays
     )
     tensors = GaussiansAndCamera(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
     pool = checked_pool(tensors, options)  # Graphs of calls that were checked but for the background; None on the CPU

@@ -23,7 +23,7 @@ from .rasterization import Rendering
 
 def project_reference(
     means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near_plane, eps2d,
-    alpha_threshold, antialiased,
+    alpha_threshold, antialiased, ray_limit_x=math.inf, ray_limit_y=math.inf,
 ):
     """Return means2d, conics, depths, opacities and extents (0 if culled) of project_to_camera(), by torch."""
     fx, fy, cx, cy = intrinsics
@@ -38,6 +38,7 @@ def project_reference(
     beyond_x, beyond_y = FRUSTUM_MARGIN * width / 2, FRUSTUM_MARGIN * height / 2
     jx = torch.maximum(torch.minimum(x_ratio, (width - cx + beyond_x) / fx), -(cx + beyond_x) / fx)
     jy = torch.maximum(torch.minimum(y_ratio, (height - cy + beyond_y) / fy), -(cy + beyond_y) / fy)
+    jx, jy = jx.clamp(-ray_limit_x, ray_limit_x), jy.clamp(-ray_limit_y, ray_limit_y)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx * jx / z], 1), torch.stack([zero, fy / z, -fy * jy / z], 1)], 1
@@ -104,7 +105,7 @@ def blend_reference(
 def rasterize_reference(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height,
     *, near_plane=NEAR_PLANE, eps2d=EPS2D, alpha_threshold=ALPHA_THRESHOLD, antialiased=False,
-    transmittance_min=TRANSMITTANCE_MIN,
+    ray_limit_x=math.inf, ray_limit_y=math.inf, transmittance_min=TRANSMITTANCE_MIN,
 ) -> Rendering:
     """Do what rasterize() does by torch alone, for float64 truth and for comparison.
 
@@ -112,7 +113,7 @@ def rasterize_reference(
     """
     means2d, conics, depths, opacities, extents = project_reference(
         means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near_plane, eps2d,
-        alpha_threshold, antialiased,
+        alpha_threshold, antialiased, ray_limit_x, ray_limit_y,
     )
     image, transmittance = blend_reference(
         means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold, transmittance_min

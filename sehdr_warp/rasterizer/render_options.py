@@ -1,5 +1,6 @@
 """The options of a rendered image, and their ranges."""
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -32,6 +33,8 @@ class RenderOptions(NamedTuple):
     depth: bool = False
     max_intersections: int | None = None
     deterministic: bool = False
+    ray_limit_x: float = math.inf
+    ray_limit_y: float = math.inf
 
     def checked(self, device: torch.device) -> "RenderOptions":
         """Return the options as Python's types; raise TypeError or ValueError for values out of range."""
@@ -44,6 +47,8 @@ class RenderOptions(NamedTuple):
                 "give max_intersections"
             )
         real("eps2d", self.eps2d, is_not_negative, "a number from 0")
+        for name in ("ray_limit_x", "ray_limit_y"):
+            real(name, getattr(self, name), lambda number: number > 0, "above 0")
         check_render_options(self.near_plane, self.alpha_threshold)
         flags = {name: boolean(name, getattr(self, name)) for name in ("antialiased", "depth", "deterministic")}
         width, height = image_size(self.width, self.height)

@@ -28,13 +28,15 @@ def total(results, visible):
 
 
 @pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
+@pytest.mark.parametrize("limits", [(math.inf, math.inf), (0.3, 0.1)], ids=["of the image", "narrower"])
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-11), (torch.float32, 1e-4)])
-def test_values_and_gradients_are_the_references(device, dtype, bound, antialiased):
+def test_values_and_gradients_are_the_references(device, dtype, bound, limits, antialiased):
     leaves = [tensor.requires_grad_() for tensor in inputs()]
     ours = [tensor.detach().to(device, dtype).requires_grad_() for tensor in leaves]
-    arguments = [*leaves, *OPTIONS[:5], antialiased]
-    truth = project_reference(*arguments)
-    results = project_to_camera(*ours, OPTIONS._replace(antialiased=antialiased))
+    x, y = limits
+    truth = project_reference(*leaves, *OPTIONS[:5], antialiased, x, y)
+    options = OPTIONS._replace(antialiased=antialiased, ray_limit_x=x, ray_limit_y=y)
+    results = project_to_camera(*ours, options)
     visible = truth[4][:, 0] > 0
     assert 30 < visible.sum() < 120 and torch.equal(results.extents.cpu()[:, 0] > 0, visible)
     for name, mine, true in zip(RESULTS, results, truth, strict=True):

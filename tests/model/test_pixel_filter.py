@@ -172,6 +172,21 @@ def test_photos_that_show_a_gaussian_at_their_border_stay(camera, aside):
     assert not torch.equal(light[1], light[2]), "what happens without the near photo"
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_middle_of_a_wide_view_is_that_of_the_photo(antialiased):
+    """A Gaussian beside the photo's field of view does not reach into it."""
+    wide, light = replace(PHOTO, width=48 + 384, cx=24.0 + 192), []
+    for photos in ([PHOTO], [wide, PHOTO], []):
+        field = lamp(photos, antialiased=antialiased)
+        places, sizes = torch.tensor([[1.0, 0.0, 0.3]]).expand(3, 3), torch.full((3, 3), math.log(0.1))
+        field.gaussians.overwrite({"means": places, "log_scales": sizes})
+        light.append(field.render(wide).hdr)
+        assert not field.render(PHOTO).hdr.any()
+    assert not light[0][:, 192:240].any() and light[0].max() > 1
+    assert torch.equal(light[1], light[2]), "it is as wide as a photo"
+    assert light[2][:, 192:240].max() > 1, "what happens without"
+
+
 def test_filters_that_a_render_under_autocast_leaves_are_precise():
     places = torch.tensor([[-0.5, -0.3, 2.0], [0.1, 0.2, 3.0], [9.0, 0.4, 2.5]])
     moved = [replace(PHOTO, world_to_camera=pose_at(0.1234))]

@@ -62,6 +62,8 @@ def with_nan_and_logits(opacities):
         ("alpha_threshold", lambda _: float("nan"), ValueError, "alpha_threshold nan is not"),
         ("near_plane", lambda _: None, TypeError, "near_plane is None, expected a number"),
         ("eps2d", lambda _: torch.tensor(0.3), TypeError, r"eps2d is tensor\(0.3000\), expected a number"),
+        ("ray_limit_x", lambda _: 0.0, ValueError, "ray_limit_x 0.0 is not above 0"),
+        ("ray_limit_y", lambda _: "1", TypeError, "ray_limit_y is '1', expected a number"),
         ("alpha_threshold", lambda _: 1e-50, ValueError, "alpha_threshold 1e-50 is not between 1e-37 and 1"),
         ("antialiased", lambda _: "no", TypeError, "antialiased is 'no', expected True or False"),
         ("depth", lambda _: 1, TypeError, "depth is 1, expected True or False"),

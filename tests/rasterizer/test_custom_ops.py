@@ -1,5 +1,6 @@
 """Operations within torch.compile: nodes of one graph, with the same bits, in silence."""
 
+import math
 import subprocess
 import sys
 
@@ -67,7 +68,7 @@ def test_an_operation_compiles_by_itself_after_programs_that_do_not():
 OPTIONS = 0.01, 0.3, 1e-3, False
 
 
-@pytest.mark.parametrize("options", [(False, None, False), (True, 400, True)])
+@pytest.mark.parametrize("options", [(False, None, False, math.inf, math.inf), (True, 400, True, 0.5, 0.4)])
 def test_torch_checks_the_node(options, device):
     tensors = [leaf.detach().requires_grad_() for leaf in splats(device, torch.float32)]
     arguments = [*tensors, torch.ones(2, device=device)], WIDTH, HEIGHT, *OPTIONS, *options

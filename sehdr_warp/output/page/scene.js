@@ -50,7 +50,7 @@ const opening = () => facts.opening || facts.views[facts.first].camera;
 
 // The engine's Gaussians end early, are lifted to make up for it, are left out where small, shrunk where larger than the
 // picture, and drawn at any nearness; ours end at the same opacity alone and behind the near plane. Both linearize the
-// projection, ours no farther outside of the picture than a margin. The engine's low-pass filter has a fourth of our
+// projection, ours no farther outside of the picture than a margin, and of the photos. The engine's low-pass filter has a fourth of our
 // variance, because its lengths are half pixels. Here it is the photos' filter (see pixel_filter.py) and at least a
 // pixel's, and opacities keep the light that the photos' filter gives.
 function asOurs(material, chunks) {
@@ -63,7 +63,7 @@ function asOurs(material, chunks) {
   change("gsplatPS", /if \(A > 1.0\) \{\s*discard;\s*\}\s*mediump float alpha = normExp\(A\)/, "mediump float alpha = exp(A * -4.0)");
   change("gsplatCornerVS", "float vmin = min(1024.0, min(viewport_size.x, viewport_size.y));", "float vmin = 1e9;\n\tif (center.proj.w < camera_params.z) return false;");
   change("gsplatCornerVS", "vec2 J2 = -J1 / vp.z * vp.xy;",
-    `vec2 at = clamp(center.proj.xy / center.proj.w, ${-1 - facts.margin}, ${1 + facts.margin}) + matrix_projection[2].xy;\n\t\tvec2 J2 = J1 * at / vec2(center.projMat00, center.projMat11);`);
+    `vec2 at = clamp(center.proj.xy / center.proj.w, ${-1 - facts.margin}, ${1 + facts.margin}) + matrix_projection[2].xy;\n\t\tvec2 most = vec2(${facts.rays.map(x => x.toFixed(6))}) * vec2(center.projMat00, center.projMat11);\n\t\tat = clamp(at, -most, most);\n\t\tvec2 J2 = J1 * at / vec2(center.projMat00, center.projMat11);`);
   change("gsplatCornerVS", "uniform float minPixelSize;", "uniform float minPixelSize;\nuniform float photoFilter, pixelFilter;");
   change("gsplatCornerVS", /cov(\[.\])\1 \+ 0\.3/g, "cov$1$1 + pixelFilter");
   change("gsplatCornerVS", "detOrig = cov[0][0] * cov[1][1]", "detOrig = (cov[0][0] + photoFilter) * (cov[1][1] + photoFilter)");
