@@ -7,6 +7,7 @@ reduced photos. They are decided before any block is trained, so colors agree at
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,14 +26,17 @@ from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.scene_description import SFM_LAYOUTS, in_world_of_run
 from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationValues
 from ..scene import Camera, Scene, View
+from ..scene.camera import MAX_SIDE
 from ..scene.exposure.compensation import ExposureCompensation
 from ..scene.normalization import Normalization, normalization_of
+from ..scene.wide_camera import perspective_cameras
 from ..subsets import every_nth
 from ..training.compensation import SharedDecisions, estimate_compensation, estimates_compensation
 from ..training.cost import OVERLAP
 from ..training.initialization import base_time_of, check_views, match_points, response_for_training
 from ..training.matching import LARGEST_SIDE
-from ..training.plan import STEPS_PER_PHOTO
+from ..training.plan import STEPS_PER_PHOTO, antialiasing
+from ..training.scene_facts import focal_ratio
 from .division import Cell, Division, divide, largest_count, thin_out, weights_of
 
 log = logging.getLogger(__name__)
@@ -77,6 +81,7 @@ class BlockPlanValues(BaseModel):
     base_time: Annotated[float, Field(gt=0)]
     normalization: NormalizationValues
     exposure_compensation: GainValues | None
+    antialiased: bool | None = None
     exposure_times: dict[str, Annotated[float, Field(gt=0)]]
     photo_bytes: dict[str, Annotated[int, Field(ge=0)]] = {}
     cameras: dict[str, dict[str, Any]] = {}
@@ -108,15 +113,15 @@ class BlockPlan:
         return Division(self.axes, tuple(block.cell for block in self.blocks), margins, ())
 
     def config_of(self, block: Block) -> Config:
-        """Return the config of a block: its part of the budget of Gaussians, and model.antialiased as requested.
+        """Return the config of a block: its part of the budget of Gaussians, and model.antialiased as of the set.
 
         The budget is that of the requested mcmc.cap_density, 120 by default, on a GPU too. The plan of a training with
         many photos raises the default to training.plan.GPU_CAP_DENSITY and leaves the smaller value of a block; only a
-        block that has all photos is planned as one training. Blocks are rendered as one scene, so none turns on
-        model.antialiased by its own photos.
+        block that has all photos is planned as one training.
         """
         root = math.sqrt(block.fraction)
         fields: dict[str, object] = {"plan.keep": sorted({*self.config.plan.keep, "model.antialiased"})}
+        fields["model.antialiased"] = self.shared.antialiased
         # These are multiples of the root of the block's pixels, and the budget of the set is divided by its pixels.
         for path in ("mcmc.cap_density", "model.initial_density"):
             table, name = path.split(".")
@@ -158,6 +163,7 @@ class BlockPlan:
             "base_time": self.shared.base_time,
             "normalization": self.normalization.to_dict(),
             "exposure_compensation": None if compensation is None else compensation.to_dict(),
+            "antialiased": self.shared.antialiased,
             "exposure_times": dict(self.exposure_times),
             "photo_bytes": dict(self.photo_bytes),
             "cameras": {name: camera.to_dict() for name, camera in self.cameras.items()},
@@ -183,9 +189,11 @@ class BlockPlan:
             raise InputError(path, str(error), remedy) from None
         if values["format"] != FORMAT:
             raise InputError(path, f"is of format {values['format']}, not {FORMAT}", remedy)
-        compensation = values["exposure_compensation"]
+        compensation, config = values["exposure_compensation"], config_from_dict(values["config"], path)
         shared = SharedDecisions(
-            values["base_time"], None if compensation is None else ExposureCompensation.from_dict(compensation)
+            values["base_time"],
+            None if compensation is None else ExposureCompensation.from_dict(compensation),
+            config.model.antialiased if (own := values.get("antialiased")) is None else own,  # None in older plans
         )
         return BlockPlan(
             values["scene"],
@@ -196,7 +204,7 @@ class BlockPlan:
             values["exposure_times"],
             values.get("photo_bytes", {}),
             cameras,
-            config_from_dict(values["config"], path),
+            config,
             np.array(values["axes"], np.float64),
             blocks,
         )
@@ -226,12 +234,12 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
         compensation = result.compensation
         log.info("plan: %s: %s (%s)", result.decision.name, result.decision.choice, result.decision.reason)
     compensated = scene if compensation is None else compensation.normalize_photos(scene, response)
-    shared = SharedDecisions(base_time_of(compensated), compensation)
-    views = scene.train_views
-    cameras = [view.camera for view in views]
+    views = [replace(view, camera=_camera_of_training(view, data.get("max_size"))) for view in scene.train_views]
+    shared = SharedDecisions(base_time_of(compensated), compensation, _antialiased(views, config))
+    cameras = [view.camera for view in scene.train_views]
     points = _places(compensated, response, device)
     if count is None:
-        count = blocks_for(len(views), _pixels(scene, data.get("max_size")), config)
+        count = blocks_for(len(views), sum(view.camera.pixel_count for view in views), config)
         division = largest_count(scene.name, cameras, points, count) if count > 1 else None
         if division is None:
             reason = "its photos do not show different places" if count > 1 else "its photos are few enough"
@@ -294,19 +302,23 @@ def _places(scene: Scene, response: Response, device: torch.device) -> np.ndarra
     return match_points(part, MATCHED, response=response, device=device)[0]
 
 
-def _pixels(scene: Scene, max_size: int | None) -> float:
-    """Return the approximate number of pixels of all training photos at the size of the training."""
-    view = scene.train_views[0]
-    width, height = view.camera.width, view.camera.height
-    factor = 1.0
-    if view.source is not None and max(width, height) == LARGEST_SIDE:
-        try:
-            with Image.open(view.source) as photo:
-                longest = max(photo.size)
-            factor = (min(longest, max_size or longest) / LARGEST_SIDE) ** 2
-        except OSError:
-            pass  # RAW and float photos: as many as the reduced ones.
-    return factor * sum(each.camera.pixel_count for each in scene.train_views)
+def _camera_of_training(view: View, max_size: int | None) -> Camera:
+    """Return the camera of a photo that was reduced to LARGEST_SIDE, at the size of the training."""
+    camera, longest = view.camera, 0
+    if view.source is not None and max(camera.width, camera.height) == LARGEST_SIDE:
+        with suppress(OSError), Image.open(view.source) as photo:  # RAW and float photos: as the reduced ones.
+            longest = min(max(photo.size), max_size or MAX_SIDE)
+    scale = max(1.0, longest / LARGEST_SIDE)
+    return camera.resized(round(scale * camera.width), round(scale * camera.height))
+
+
+def _antialiased(views: Sequence[View], config: Config) -> bool:
+    """Return model.antialiased for a set, as the plan of one training decides it."""
+    decision = antialiasing(focal_ratio(perspective_cameras(views)), config)
+    if not decision.fields or not config.plan.enabled or "model.antialiased" in config.plan.keep:
+        return config.model.antialiased
+    log.info("plan: antialiasing: %s (%s)", decision.choice, decision.reason)
+    return True
 
 
 def _photo_bytes(views: Sequence[View]) -> dict[str, int]:

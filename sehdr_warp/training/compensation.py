@@ -63,10 +63,11 @@ class CompensationEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class SharedDecisions:
-    """Decisions that several trainings of one set of photos share, so that their Gaussians have the same colors."""
+    """Decisions that several trainings of one set of photos share, so that their Gaussians render as one scene."""
 
     base_time: float  # Exposure time dt_1 that colors refer to, seconds
     compensation: ExposureCompensation | None  # Correction of all photos; None if there is no drift
+    antialiased: bool = False  # model.antialiased
 
     def compensation_of(self, views: Sequence[View]) -> ExposureCompensation | None:
         """Return the entries of some views of the compensation."""

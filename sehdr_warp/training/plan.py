@@ -340,9 +340,10 @@ def _dropout(facts: SceneFacts, config: Config, device: torch.device) -> Decisio
     return Decision({"model.dropout": FEW_PHOTOS_DROPOUT}, f"up to {FEW_PHOTOS_DROPOUT:.0%} of the Gaussians", reason)
 
 
-def _antialiasing(facts: SceneFacts, config: Config, device: torch.device) -> Decision:
-    reason = f"focal lengths of the photos, in pixels, differ by a factor of {facts.focal_ratio:.1f}"
-    if config.model.antialiased or facts.focal_ratio < FOCAL_RATIO:
+def antialiasing(focal_ratio: float, config: Config) -> Decision:
+    """Decide whether opacities are compensated, by the ratio of the photos' focal lengths."""
+    reason = f"focal lengths of the photos, in pixels, differ by a factor of {focal_ratio:.1f}"
+    if config.model.antialiased or focal_ratio < FOCAL_RATIO:
         return Decision({}, "on" if config.model.antialiased else "off", reason)
     return Decision({"model.antialiased": True}, "on", reason)
 
@@ -362,7 +363,7 @@ RULES: dict[str, Callable[[SceneFacts, Config, torch.device], Decision]] = {
     "iterations": _iterations,
     "rates": _rates,
     "dropout": _dropout,
-    "antialiasing": _antialiasing,
+    "antialiasing": lambda facts, config, device: antialiasing(facts.focal_ratio, config),
     "confidence": _confidence,
 }
 """The rules of a plan, in order."""

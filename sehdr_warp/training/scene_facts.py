@@ -87,11 +87,11 @@ def measure_scene(scene: Scene, seed: int = 0) -> SceneFacts:
         plateau=0 if scene.light_known else _plateau(read_views),
         pixel_bytes=pixel_bytes(photos),
         clipped_when_dark=float(_photo_statistics(dark_views)[:, 0].mean()),
-        focal_ratio=_focal_ratio(cameras),
+        focal_ratio=focal_ratio(cameras),
     )
 
 
-def _focal_ratio(cameras: Sequence[Camera]) -> float:
+def focal_ratio(cameras: Sequence[Camera]) -> float:
     """Return how much finer some cameras resolve a place from one distance than others: SceneFacts.focal_ratio."""
     shortest, longest = np.quantile([math.sqrt(camera.fx * camera.fy) for camera in cameras], [0.1, 0.9])
     return float(longest / shortest)

@@ -1,13 +1,15 @@
 """blocks.json as somebody may have sent it: names and links that lead elsewhere, and odd shapes."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from sehdr_warp.blocks.block_plan import FILE, MOST_BLOCKS, Block, BlockPlan, blocks_for
+from sehdr_warp.blocks.block_plan import FILE, MOST_BLOCKS, Block, BlockPlan, blocks_for, make_block_plan
 from sehdr_warp.blocks.train import train_in_blocks
 from sehdr_warp.errors import InputError
 from sehdr_warp.response import response_by_name
@@ -56,8 +58,46 @@ def test_blocks_agree_on_opacity_compensation_whatever_their_photos(plan):
     assert make_plan(mixed, Config()).config.model.antialiased
     for block in plan.blocks:
         assert not make_plan(mixed, plan.config_of(block)).config.model.antialiased
-    own = replace(plan, config=override_config(plan.config, {"model.antialiased": True}))
-    assert all(own.config_of(block).model.antialiased for block in own.blocks)
+    on = replace(plan, shared=replace(plan.shared, antialiased=True))
+    for block in on.blocks:
+        assert make_plan(toy_scene(), on.config_of(block)).config.model.antialiased
+
+
+def test_plans_without_opacity_compensation_have_that_of_their_config(tmp_path, plan):
+    file = tmp_path / "run" / FILE
+    values = json.loads(file.read_text())
+    del values["antialiased"]
+    for on in (True, False):
+        values["config"]["model"]["antialiased"] = on
+        file.write_text(json.dumps(values))
+        assert BlockPlan.read(tmp_path / "run").shared.antialiased == on
+
+
+@pytest.mark.parametrize(
+    ("fields", "max_size", "on"),
+    [
+        ({}, None, True),
+        ({}, 24, False),
+        ({"plan.enabled": False}, None, False),
+        ({"plan.keep": ["model.antialiased"]}, None, False),
+        ({"plan.enabled": False, "model.antialiased": True}, 24, True),
+    ],
+)
+def test_opacity_compensation_is_decided_once_by_the_photos_of_the_training(
+    survey, tmp_path, monkeypatch, fields, max_size, on
+):
+    """A set is divided by reduced photos, which may all have one size."""
+    shutil.copytree(survey, tmp_path / "town")
+    for file in sorted((tmp_path / "town" / "images").iterdir())[1::4]:
+        with Image.open(file) as photo:
+            photo.resize((24, 18)).save(file)
+    monkeypatch.setattr("sehdr_warp.blocks.block_plan.LARGEST_SIDE", 24)
+    data = {"path": str(tmp_path / "town"), "exposure_index": None, "max_size": max_size, "holdout": None}
+    plan = make_block_plan(data, override_config(Config(), {"response.name": "srgb"} | fields), torch.device("cpu"), 2)
+    assert plan is not None
+    plan.write(tmp_path)
+    assert all(plan.config_of(block).model.antialiased == on for block in BlockPlan.read(tmp_path).blocks)
+    assert BlockPlan.read(tmp_path).shared.antialiased == on
 
 
 @pytest.mark.parametrize(
