@@ -5,7 +5,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import torch
@@ -39,9 +39,19 @@ def machine_figures(device: torch.device) -> dict:
 
 def precompiling(config: Config) -> AbstractContextManager[None]:
     """Return a context that compiles, in the background, the kernels that a training will launch."""
+    return precompiled(_kernels_of(config), ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
+
+
+def precompiling_planned(config: Config, requested: Config) -> AbstractContextManager[None]:
+    """Return a context like precompiling() for kernels that the plan of a requested config made necessary."""
+    earlier = _kernels_of(requested)
+    kernels = [kernel for kernel in _kernels_of(config) if kernel not in earlier]
+    return precompiled(kernels) if kernels else nullcontext()
+
+
+def _kernels_of(config: Config) -> list[Any]:
     plain = config.model.tone_map == "pixel" and not config.fusion.enabled
-    kernels = training_kernels(3 if plain else None, config.model.antialiased)
-    return precompiled(kernels, ["scipy.spatial"])  # Half a second, at the first Gaussians' neighbors.
+    return training_kernels(3 if plain else None, config.model.antialiased)
 
 
 class _Settings(NamedTuple):

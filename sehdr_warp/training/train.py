@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from operator import attrgetter
@@ -27,7 +28,7 @@ from .compensation import SharedDecisions, estimate_compensation, estimates_comp
 from .hdr_truth import check_scene_truth
 from .initialization import check_views, depth_of_points, make_field, make_matcher, response_for_training
 from .plan import check_fields, make_plan
-from .process_settings import summary_writer
+from .process_settings import precompiling_planned, summary_writer
 from .ranks import Ranks
 from .run_output import RunOutput
 from .scene_facts import PointFacts
@@ -147,31 +148,33 @@ def _new_trainer(
     check_views(scene)
     normalization = normalization_of(scene)
     normalized_scene = normalization.scene(scene)
+    requested = config
     plan = make_plan(normalized_scene, config, device) if config.plan.enabled else None
     if plan is None:
         check_fields(normalized_scene, config)  # As make_plan() does.
     else:
         config = plan.config
     check_scene_truth(scene, config.loss)  # Here, before the photos are matched; GradientStep repeats it.
-    response = response_for_training(scene, config)
-    started = time.perf_counter()
-    depth = depth_of_points(normalized_scene)
-    compensation, matcher = None if shared is None else shared.compensation_of(scene.views), None
-    if shared is None and plan is not None and estimates_compensation(scene, config, response):
-        estimate = estimate_compensation(normalized_scene, config, response, device, depth)
-        compensation, matcher = estimate.compensation, estimate.matcher
-        plan = replace(plan, decisions=(*plan.decisions, estimate.decision))
-    photos = scene if compensation is None else compensation.normalize_photos(scene, response)
-    normalized_photos = normalization.scene(photos)
-    # One matcher for compensation, initial points and seeds; made when it is needed, because it takes long.
-    get_matcher = cache(lambda: matcher or make_matcher(normalized_photos, response, device, depth))
-    field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
-    trainer = Trainer(
-        photos, config, field, get_matcher=get_matcher, ranks=ranks, point_facts=PointFacts(median_depth=depth)
-    )
-    light = trainer.data_manager.clipped_light_targets  # Estimated once, for this and for the loss.
-    if light is not None and not config.model.init_file:
-        brighten_clipped(field, normalized_photos.train_views, light)
+    with precompiling_planned(config, requested) if device.type == "cpu" else nullcontext():
+        response = response_for_training(scene, config)
+        started = time.perf_counter()
+        depth = depth_of_points(normalized_scene)
+        compensation, matcher = None if shared is None else shared.compensation_of(scene.views), None
+        if shared is None and plan is not None and estimates_compensation(scene, config, response):
+            estimate = estimate_compensation(normalized_scene, config, response, device, depth)
+            compensation, matcher = estimate.compensation, estimate.matcher
+            plan = replace(plan, decisions=(*plan.decisions, estimate.decision))
+        photos = scene if compensation is None else compensation.normalize_photos(scene, response)
+        normalized_photos = normalization.scene(photos)
+        # One matcher for compensation, initial points and seeds; made when it is needed, because it takes long.
+        get_matcher = cache(lambda: matcher or make_matcher(normalized_photos, response, device, depth))
+        field = make_field(photos, config, response, device, get_matcher, None if shared is None else shared.base_time)
+        trainer = Trainer(
+            photos, config, field, get_matcher=get_matcher, ranks=ranks, point_facts=PointFacts(median_depth=depth)
+        )
+        light = trainer.data_manager.clipped_light_targets  # Estimated once, for this and for the loss.
+        if light is not None and not config.model.init_file:
+            brighten_clipped(field, normalized_photos.train_views, light)
     trainer.seconds = time.perf_counter() - started
     # The folder is begun last, when the scene is known to be usable.
     plan_values, state = None if plan is None else plan.to_dict(), state_of(trainer)

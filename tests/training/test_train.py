@@ -1,5 +1,6 @@
 """Whole trainings of seconds: they learn, they report, they stop tidily, and they refuse what cannot work."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -7,17 +8,37 @@ import pytest
 import torch
 
 from sehdr_warp.errors import InputError
+from sehdr_warp.rasterizer.precompile import training_kernels
 from sehdr_warp.response import response_by_name
+from sehdr_warp.runs.config import Config
 from sehdr_warp.runs.config_files import override_config
 from sehdr_warp.runs.run import load_run
 from sehdr_warp.scene import codes_of
+from sehdr_warp.training import process_settings
 from sehdr_warp.training.initialization import make_field, response_for_training
 from sehdr_warp.training.run_output import evaluate_views
 from sehdr_warp.training.scene_facts import PointFacts
 from sehdr_warp.training.train import create_trainer, train
 from sehdr_warp.training.trainer import Trainer
 
-from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, quick, toy_scene
+from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, quick, toy_scene, with_smaller_photos
+
+
+@pytest.mark.parametrize(
+    ("fields", "part", "antialiased"),
+    [({}, 0.5, True), ({"fusion.enabled": True}, 1.0, False), ({}, 1.0, False)],
+    ids=["photos of two sizes", "fusion that is left out", "as requested"],
+)
+def test_kernels_that_the_plan_makes_necessary_are_compiled_ahead(
+    tmp_path, monkeypatch, scene, fields, part, antialiased
+):
+    compiled = []
+    monkeypatch.setattr(process_settings, "precompiled", lambda kernels, *_: compiled.extend(kernels) or nullcontext())
+    requested = override_config(Config(), {"response.name": "srgb"} | fields)
+    with process_settings.precompiling(requested):
+        trainer = create_trainer(with_smaller_photos(scene, part), tmp_path / "run", requested, device="cpu")
+    assert trainer.field.antialiased == antialiased and not trainer.config.fusion.enabled
+    assert set(compiled) >= set(training_kernels(3, antialiased)) and len(set(compiled)) == len(compiled)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
