@@ -25,7 +25,7 @@ the radix sort. Depths outside of that range compare equal."""
 
 @cache
 def tile_kernels(dtype) -> SimpleNamespace:
-    """Return pack_splats, key_by_depth, emit_by_depth, emit_by_index and gather_intersections for a scalar type."""
+    """Return the kernels that pack, order and list splats, and sum gradients of intersections, for a scalar type."""
     g = geometry(dtype)
     real, vec2, vec3, vec4 = g.real, g.vec2, g.vec3, g.vec4
     reals, reals2d = wp.array(dtype=real), wp.array2d(dtype=real)
@@ -101,6 +101,18 @@ def tile_kernels(dtype) -> SimpleNamespace:
                     if tile_is_touched(xy_opacity, conic_cutoff, column, row):
                         touched += 1
         counts[i] = wp.int64(touched)
+
+    @wp.kernel(module="unique", module_options=options)
+    def turn_depths(
+        range_start: int,
+        means2d: vec2s, depths: reals, intrinsics: vec4s, axis: wp.array(dtype=vec3), along: reals,
+    ):
+        """Write depths along the axis, in the camera's coordinates: positive, at least a thousandth of the depths."""
+        i = range_start + wp.tid()
+        pinhole = intrinsics[0]
+        mean = means2d[i]
+        ray = vec3((mean[0] - pinhole[2]) / pinhole[0], (mean[1] - pinhole[3]) / pinhole[1], real(1.0))
+        along[i] = depths[i] * wp.max(wp.dot(ray, axis[0]), real(0.001))
 
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(
@@ -192,7 +204,8 @@ def tile_kernels(dtype) -> SimpleNamespace:
             sums[i, column] = total
 
     return SimpleNamespace(
-        pack_splats=pack_splats, key_by_depth=key_by_depth, gather_intersections=gather_intersections,
+        pack_splats=pack_splats, turn_depths=turn_depths, key_by_depth=key_by_depth,
+        gather_intersections=gather_intersections,
         emit_by_depth=make_emit_kernel(wp.int32, by_index=False),
         emit_by_index=make_emit_kernel(wp.int64, by_index=True),
     )

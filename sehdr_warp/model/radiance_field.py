@@ -19,18 +19,11 @@ from ..response import Response
 from ..scene import Camera
 from ..scene.camera import require_camera
 from ..scene.normalization import Normalization
+from . import pixel_filter
 from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
-from .pixel_filter import (
-    FocalRange,
-    PhotoFilters,
-    RayLimits,
-    filters_of,
-    options_at_place,
-    options_of_view,
-    wide_options,
-)
+from .pixel_filter import FocalRange, PhotoFilters, RayLimits
 from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, unpremultiply
 
 NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
@@ -104,7 +97,7 @@ class RadianceField(nn.Module):
     @cached_property
     def filters(self) -> PhotoFilters | None:
         """The photos' filter at each Gaussian, as of filters_of(); the Gaussians must not move any more."""
-        return filters_of(self)
+        return pixel_filter.filters_of(self)
 
     @cached_property
     def ray_limits(self) -> RayLimits:
@@ -126,6 +119,7 @@ class RadianceField(nn.Module):
         max_intersections: int | None = None,
         encode: bool = True,
         opacity_factors: Tensor | None = None,
+        order_axis: Tensor | None = None,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
     ) -> PhotoRender:
         """Render what a photo shows, differentiably: for training steps, render_ldr(), and fits to pictures.
@@ -138,17 +132,21 @@ class RadianceField(nn.Module):
             max_intersections: As in rasterize().
             encode: If False, `encoded` stays None if `photo_exposure` is available.
             opacity_factors: [N] factors on the opacities that are rendered, at most 1, such as those of a dropout.
+            order_axis: As in rasterize(); wide cameras order by distance.
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
                 harmonics have in this direction; the harmonics themselves then get no gradient.
         """
         opacities = self.gaussians.opacities()
         rendered_opacities = opacities if opacity_factors is None else (opacities * opacity_factors).clamp(max=1)
+        options: dict[str, Any] = {"max_intersections": max_intersections, "order_axis": order_axis}
         ratio = exposure_time / self.base_time
         values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.display_referred:
-            rendering = self._rasterize(camera, self.color_model.colors(values), max_intersections, rendered_opacities)
+            rendering = self._rasterize(
+                camera, self.color_model.colors(values), opacities=rendered_opacities, **options
+            )
             image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
@@ -156,7 +154,7 @@ class RadianceField(nn.Module):
         color_sets = self._color_sets(values, ratio, extra_images)
         first, *others = color_sets.values()
         features = torch.cat([first, *others], dim=1) if others else first
-        rendering = self._rasterize(camera, features, max_intersections, rendered_opacities)
+        rendering = self._rasterize(camera, features, opacities=rendered_opacities, **options)
         # A single image is not split, because the derivative of a split is a copy.
         parts = rendering.image.split(3, dim=2) if others else (rendering.image,)
         images = dict(zip(color_sets, parts, strict=True))
@@ -249,7 +247,7 @@ class RadianceField(nn.Module):
             features.append(self.confidence[:, None])
         if shares is not None:
             features.append(colors.mean(1, keepdim=True) * shares[:, None])
-        place = options_at_place(self, origin, gaussians.opacities(), focal_length, pixel_angle)
+        place = pixel_filter.options_at_place(self, origin, gaussians.opacities(), focal_length, pixel_angle)
         options: dict[str, Any] = place._asdict() | {"antialiased": self.antialiased}
         options |= {"near_plane": beyond / self.normalization.unit} if beyond else {}
         image, transmittance = rasterize_directions(
@@ -347,6 +345,7 @@ class RadianceField(nn.Module):
         max_intersections: int | None = None,
         opacities: Tensor | None = None,
         at_place: bool = False,
+        order_axis: Tensor | None = None,
     ) -> Rendering:
         """Rasterize features [N, C].
 
@@ -357,7 +356,7 @@ class RadianceField(nn.Module):
         if opacities is None:
             means, log_scales, quaternions = means.detach(), log_scales.detach(), quaternions.detach()
             opacities = gaussians.opacities().detach()
-        view = options_of_view(self, camera, means, log_scales, quaternions, opacities)
+        view = pixel_filter.options_of_view(self, camera, means, log_scales, quaternions, opacities)
         shapes, opacities = (means, view.log_scales, quaternions), view.opacities
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities, at_place)
@@ -371,6 +370,7 @@ class RadianceField(nn.Module):
             antialiased=self.antialiased,
             max_intersections=max_intersections,
             deterministic=self.deterministic,
+            order_axis=order_axis,
         )
 
     def _rasterize_wide(
@@ -394,7 +394,7 @@ class RadianceField(nn.Module):
             position=camera.position,
             directions=directions,
             antialiased=self.antialiased,
-            **wide_options(self, camera, log_scales, opacities, at_place)._asdict(),
+            **pixel_filter.wide_options(self, camera, log_scales, opacities, at_place)._asdict(),
         )
         none = features.new_zeros(len(features), 2)
         return Rendering(image, transmittance, none, none[:, 0], none, 0)

@@ -92,15 +92,16 @@ def _as_float(*tensors: Tensor) -> list[Tensor]:
 
 def _run_rasterize(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
     arguments: Any = tensors[:7]
-    background = tensors[7] if len(tensors) > 7 else None
-    rendering = rasterize(*arguments, background=background, **RenderOptions(*options)._asdict())
+    background, order_axis = (tensor if tensor.numel() else None for tensor in tensors[7:])
+    others: Any = {"background": background, "order_axis": order_axis}
+    rendering = rasterize(*arguments, **others, **RenderOptions(*options)._asdict())
     results = [rendering.image, rendering.transmittance, rendering.means2d, rendering.depths, rendering.extents]
     optional = rendering.depth, rendering.overflow, rendering.needed_intersections
     return results + [result for result in optional if result is not None]
 
 
 def _fake_rasterize(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
-    check_shapes(GaussiansAndCamera(*tensors[:7]), tensors[7] if len(tensors) > 7 else None)
+    check_shapes(GaussiansAndCamera(*tensors[:7]), *(tensor if tensor.numel() else None for tensor in tensors[7:]))
     options = RenderOptions(*values)
     height, width = options.height, options.width
     means, features, pose = tensors[0], tensors[4], tensors[5]
@@ -139,13 +140,13 @@ def compiled_rasterize(
     height: int,
     *,
     background: Tensor | None = None,
+    order_axis: Tensor | None = None,
     **others: Any,
 ) -> Rendering:
     """Do what rasterize() does, as a custom operator. The number of intersections is 0 without max_intersections."""
     cameras = len(world_to_camera) if world_to_camera.ndim == 3 else 1
     tensors = [means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics]
-    if background is not None:
-        tensors.append(background)
+    tensors += [means.new_empty(0) if tensor is None else tensor for tensor in (background, order_axis)]
     options = RenderOptions(width, height, **others)
     results = _rasterize_op(_as_float(*tensors), *options)
     image, transmittance, means2d, depths, extents = results[:5]

@@ -47,7 +47,8 @@ def training_kernels(channels: int | None, antialiased: bool) -> list[Any]:
     return [
         *(shared_ranges.share_ranges, plane_sweep_cpu.sweep_rows, plane_sweep.trust_depths, plane_sweep.place_matches),
         *(*blend, projection_kernel(real, antialiased, False, False), distance.compare),
-        *(harmonics.harmonics_kernel(real, 0), lists.pack_splats, lists.key_by_depth, lists.emit_by_depth),
+        *(harmonics.harmonics_kernel(real, 0), lists.pack_splats, lists.turn_depths, lists.key_by_depth),
+        lists.emit_by_depth,
         *(tiles.count_tiles, tiles.place_intersections, distance.blur_columns),
         *(distance.blur_derivatives, distance.gradient),
         *(lists.gather_intersections, harmonics.harmonics_backward_kernel(real, 0, True)),

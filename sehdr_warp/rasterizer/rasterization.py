@@ -24,7 +24,7 @@ from .cuda_graphs.cache import GraphInUse, GraphPool, checked_pool, pool_for
 from .memory import oom_context
 from .projection import GaussiansAndCamera, ProjectedGaussians, Splats2D, project_to_camera
 from .render_options import RenderOptions
-from .tile_lists import build_tile_lists, order_gaussians, pack_splats
+from .tile_lists import build_tile_lists, depths_along, order_gaussians, pack_splats
 from .torch_contract import torch_operation
 
 
@@ -102,6 +102,7 @@ def rasterize(
     deterministic: bool = False,
     ray_limit_x: float = math.inf,
     ray_limit_y: float = math.inf,
+    order_axis: Tensor | None = None,
 ) -> Rendering:
     """Rasterize Gaussians with any number of feature channels to images of cameras (3DGS, Kerbl et al. 2023).
 
@@ -141,6 +142,8 @@ def rasterize(
             image beyond its border, as in 3DGS. For an image that is wider than those that the Gaussians were trained
             on, the limit of these keeps Gaussians beside them from reaching into the middle.
         ray_limit_y: likewise y/z.
+        order_axis: [3] in the camera's coordinates, along which Gaussians are ordered by depth; by default (0, 0, 1),
+            the camera's own axis. A Gaussian that is not in front along it is first.
 
     Raises:
         TypeError: if an argument is not a tensor or not an integer.
@@ -157,17 +160,18 @@ def rasterize(
     )
     tensors = GaussiansAndCamera(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
     pool = checked_pool(tensors, options)  # Graphs of calls that were checked but for the background; None on the CPU
-    if pool is None or background is not None:
-        check_shapes(tensors, background)
+    if pool is None or background is not None or order_axis is not None:
+        check_shapes(tensors, background, order_axis)
         check_opacities(opacities)
         check_cameras(world_to_camera, intrinsics)
         options = options.checked(means.device)
     try:
         if world_to_camera.ndim == 2:
-            means2d, finish = _begin_view(tensors, options, pool or pool_for(tensors, options))
+            pool = None if order_axis is not None else pool or pool_for(tensors, options)
+            means2d, finish = _begin_view(tensors, options, pool, order_axis)
             rendering = finish(means2d)
         else:
-            rendering = _render_cameras(tensors, options)
+            rendering = _render_cameras(tensors, options, order_axis)
         if background is not None:
             behind = background[:, None, None] if background.ndim == 2 else background
             rendering.image = rendering.image + rendering.transmittance[..., None] * behind
@@ -178,7 +182,7 @@ def rasterize(
             raise
 
 
-def check_shapes(tensors: GaussiansAndCamera, background: Any) -> None:
+def check_shapes(tensors: GaussiansAndCamera, background: Any, order_axis: Any = None) -> None:
     """Raise what rasterize() does for tensors whose shapes, dtypes or devices do not fit."""
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
 
@@ -186,9 +190,11 @@ def check_shapes(tensors: GaussiansAndCamera, background: Any) -> None:
         return ("B",) if isinstance(tensor, Tensor) and tensor.ndim == ndim else ()
 
     cameras = axes(world_to_camera, 3)
-    backgrounds = {}
+    optional: dict[str, tuple[Any, tuple]] = {}
     if background is not None:
-        backgrounds = {"background": (background, (*(cameras and axes(background, 2)), "C"))}
+        optional["background"] = background, (*(cameras and axes(background, 2)), "C")
+    if order_axis is not None:
+        optional["order_axis"] = order_axis, (3,)
     check_tensors(
         means=(means, ("N", 3)),
         log_scales=(log_scales, ("N", 3)),
@@ -197,7 +203,7 @@ def check_shapes(tensors: GaussiansAndCamera, background: Any) -> None:
         features=(features, (*(cameras and axes(features, 3)), "N", "C")),
         world_to_camera=(world_to_camera, (*cameras, 4, 4)),
         intrinsics=(intrinsics, (*cameras, 4)),
-        **backgrounds,
+        **optional,
     )
     check_channels(features)
     if cameras and not len(world_to_camera):
@@ -205,7 +211,7 @@ def check_shapes(tensors: GaussiansAndCamera, background: Any) -> None:
 
 
 def _begin_view(
-    tensors: GaussiansAndCamera, options: RenderOptions, pool: GraphPool | None
+    tensors: GaussiansAndCamera, options: RenderOptions, pool: GraphPool | None, order_axis: Tensor | None
 ) -> tuple[Tensor, Callable[[Tensor], Rendering]]:
     """Project to one camera; return means2d [N, 2], and a function that renders from them.
 
@@ -217,7 +223,10 @@ def _begin_view(
         return _begin_replay(graph, tensors, options)
     projected = project_to_camera(*tensors.without_features, options=options)
     features = tensors.features
-    return projected.means2d, lambda means2d: render_projected(projected._replace(means2d=means2d), features, options)
+    order = None if order_axis is None else depths_along(order_axis, projected, tensors.intrinsics)
+    return projected.means2d, lambda means2d: render_projected(
+        projected._replace(means2d=means2d), features, options, order_depths=order
+    )
 
 
 def _begin_replay(
@@ -240,7 +249,7 @@ def _begin_replay(
     return means2d, finish
 
 
-def _render_cameras(tensors: GaussiansAndCamera, options: RenderOptions) -> Rendering:
+def _render_cameras(tensors: GaussiansAndCamera, options: RenderOptions, order_axis: Tensor | None) -> Rendering:
     """Render to several cameras; opacities and features may have an axis of cameras too."""
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics = tensors
     count = len(world_to_camera)
@@ -252,7 +261,9 @@ def _render_cameras(tensors: GaussiansAndCamera, options: RenderOptions) -> Rend
         strict=True,
     )
     calls = [GaussiansAndCamera(means, log_scales, quaternions, *each) for each in of_cameras]
-    centers, finishes = zip(*(_begin_view(call, options, pool_for(call, options)) for call in calls), strict=True)
+    pools = [None if order_axis is not None else pool_for(call, options) for call in calls]
+    begun = [_begin_view(call, options, pool, order_axis) for call, pool in zip(calls, pools, strict=True)]
+    centers, finishes = zip(*begun, strict=True)
     # One tensor that every image is rendered from, so that its gradient holds every camera's.
     means2d = torch.stack(centers)
     return join_renderings(means2d, [finish(part) for finish, part in zip(finishes, means2d, strict=True)])
@@ -276,14 +287,17 @@ def render_projected(
     features: Tensor,
     options: RenderOptions,
     store_absolute: Callable[[Tensor], None] | None = None,
+    order_depths: Tensor | None = None,
 ) -> Rendering:
     """Render 2D Gaussians of one camera with features [N, C].
 
     Sets the extents of Gaussians whose features are not finite to 0, in place.
 
-    store_absolute: of watch_absolute_gradients(), for compat.gsplat.
+    store_absolute: of watch_absolute_gradients(), for compat.gsplat. order_depths: [N] to order by, see depths_along().
     """
     splats = _to_splats(projected, features, options)
+    if order_depths is not None:
+        splats = splats._replace(depths=order_depths)
     width, height, threshold = options.width, options.height, options.alpha_threshold
     packed = pack_splats(splats, threshold, width, height)
     # Whether gradients are summed in a fixed order, as atomics of a GPU do not.

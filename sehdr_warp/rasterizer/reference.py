@@ -105,7 +105,7 @@ def blend_reference(
 def rasterize_reference(
     means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics, width, height,
     *, near_plane=NEAR_PLANE, eps2d=EPS2D, alpha_threshold=ALPHA_THRESHOLD, antialiased=False,
-    ray_limit_x=math.inf, ray_limit_y=math.inf, transmittance_min=TRANSMITTANCE_MIN,
+    ray_limit_x=math.inf, ray_limit_y=math.inf, order_axis=None, transmittance_min=TRANSMITTANCE_MIN,
 ) -> Rendering:
     """Do what rasterize() does by torch alone, for float64 truth and for comparison.
 
@@ -115,7 +115,11 @@ def rasterize_reference(
         means, log_scales, quaternions, opacities, world_to_camera, intrinsics, width, height, near_plane, eps2d,
         alpha_threshold, antialiased, ray_limit_x, ray_limit_y,
     )
+    order_depths = depths
+    if order_axis is not None:
+        center = means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+        order_depths = torch.maximum(center @ order_axis, 0.001 * depths)
     image, transmittance = blend_reference(
-        means2d, conics, opacities, features, depths, extents, width, height, alpha_threshold, transmittance_min
+        means2d, conics, opacities, features, order_depths, extents, width, height, alpha_threshold, transmittance_min
     )
     return Rendering(image, transmittance, means2d, depths, extents, 0)

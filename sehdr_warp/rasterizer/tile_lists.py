@@ -16,7 +16,7 @@ from ..kernels import tiles as kernels
 from ..kernels.blend_cuda import padded_channels
 from ..kernels.constants import TILE_SIZE
 from ..parallel import thread_count
-from .projection import Splats2D
+from .projection import ProjectedGaussians, Splats2D
 from .render_options import MAX_INTERSECTIONS
 from .warp_launch.launching import FixedLaunch, fixed_launch, launch, sort_pairs, warp_scalar
 from .warp_launch.threads import torch_threads
@@ -193,6 +193,15 @@ def build_tile_lists(
     order_copy = EmitOrder(order.clone(), cumulative_counts) if keep_emit_order else None
     lists = tile_ranges, gaussians, subtile_masks, order_copy, emit_indices
     return TileLists(*lists, width, height, overflow, total.clone())
+
+
+@torch.no_grad()
+def depths_along(axis: Tensor, projected: ProjectedGaussians, intrinsics: Tensor) -> Tensor:
+    """Return depths [N] of Gaussians along an axis [3] of the camera's coordinates, at least a thousandth of theirs."""
+    inputs = tuple(tensor.contiguous() for tensor in (projected.means2d, projected.depths, intrinsics, axis))
+    along = torch.empty_like(projected.depths)
+    launch(kernels.tile_kernels(warp_scalar(along.dtype)).turn_depths, len(along), *inputs, along)
+    return along
 
 
 def depth_order(depths: Tensor, extents: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ capacity, so that StepRunner can capture it as a CUDA graph; on several GPUs, as
 average.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -103,6 +104,33 @@ class Dropout:
         self.factors.bernoulli_(left, generator=self._generator).div_(left)
 
 
+class OrderAxis:
+    """Turns the axis along which a step orders Gaussians by depth, at random around the camera's.
+
+    Cameras in one place that look in other directions order Gaussians differently, because each does it by depth along
+    its own axis. What is behind others in all photos is not constrained, and may be in front if the camera turns. So
+    the steps show it now and then.
+
+    Attributes:
+        axis: [3] of the next step, in the camera's coordinates; None if it is always the camera's own.
+    """
+
+    def __init__(self, angle: float, random_seed: int, device: torch.device):
+        """Prepare to turn the axis by up to an angle in degrees, to the sides and up and down."""
+        self.axis = torch.tensor([0.0, 0.0, 1.0], device=device) if angle else None
+        self._slope, self._random_seed = math.tan(math.radians(angle)), random_seed
+        self._generator = torch.Generator(device)
+
+    def draw(self, iteration: int) -> None:
+        """Draw the axis of the step that ends at an iteration; the same in a resumed training.
+
+        It keeps its memory, because CUDA graphs read it.
+        """
+        if self.axis is not None:
+            self._generator.manual_seed((self._random_seed * SEED_STRIDE + iteration) % 2**63)
+            self.axis[:2].uniform_(-self._slope, self._slope, generator=self._generator)
+
+
 class GradientStep:
     """Takes gradient steps of a training: prepare(), then run().
 
@@ -141,6 +169,7 @@ class GradientStep:
         # They would fade or shrink before a photo shows them. Elsewhere the penalties remove what is not needed.
         self._spares_unseen = large_scene
         self._dropout = Dropout(config.model.dropout, config.seed, config.schedule.iterations, device)
+        self._order = OrderAxis(config.model.order_angle, config.seed, device)
         self._flat_gradients: FlatGradients | None = None  # Buffer that ranks exchange
 
     def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:
@@ -154,6 +183,7 @@ class GradientStep:
     def prepare(self, options: StepOptions, iteration: int) -> None:
         """Prepare what the step of an iteration reads or adds to: in a capture, it would lie in the graph's memory."""
         self._dropout.draw(iteration, self.field.gaussians.row_count)
+        self._order.draw(iteration)
         if options.needs_means2d_grad:
             self.strategy.allocate(self.field.gaussians.row_count, self.step_counters.device)
 
@@ -198,6 +228,7 @@ class GradientStep:
             max_intersections=max_intersections,
             encode=not target.scale.compares_exposures,
             opacity_factors=self._dropout.factors,
+            order_axis=self._order.axis,
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
         )
         loss = data_loss(field, render, target, self._loss, self._largest_truth)

@@ -67,6 +67,9 @@ def with_nan_and_logits(opacities):
         ("alpha_threshold", lambda _: 1e-50, ValueError, "alpha_threshold 1e-50 is not between 1e-37 and 1"),
         ("antialiased", lambda _: "no", TypeError, "antialiased is 'no', expected True or False"),
         ("depth", lambda _: 1, TypeError, "depth is 1, expected True or False"),
+        ("order_axis", lambda _: torch.eye(3).double(), ValueError, r"order_axis has shape \[3, 3\], expected \[3\]"),
+        ("order_axis", lambda _: torch.ones(3), ValueError, "order_axis is torch.float32 on cpu, but means is"),
+        ("order_axis", lambda _: (0, 0, 1), TypeError, "order_axis is a tuple, expected a torch tensor"),
     ],
 )
 def test_misfits_of_a_render_are_named(name, change, kind, message):

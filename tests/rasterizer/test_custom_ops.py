@@ -27,7 +27,8 @@ def step(*leaves):
     total = 0.0
     for _ in range(3):
         colors = spherical_harmonics(1, coefficients, leaves[0], torch.zeros(3)) + leaves[4]
-        rendering = rasterize(*leaves[:4], colors, *leaves[5:], WIDTH, HEIGHT, depth=True, background=torch.ones(3))
+        options = {"background": torch.ones(3), "order_axis": torch.tensor([0.3, 0.1, 1.0])}
+        rendering = rasterize(*leaves[:4], colors, *leaves[5:], WIDTH, HEIGHT, depth=True, **options)
         image = rendering.image * 2.0
         total = total + ssim(image, torch.full_like(image, 0.5)) + rendering.alpha.mean() + rendering.depth.mean()
         total = total + (rendering.means2d[:, 0] * rendering.visible).mean() + ssim_map(image, image.detach()).mean()
@@ -71,7 +72,8 @@ OPTIONS = 0.01, 0.3, 1e-3, False
 @pytest.mark.parametrize("options", [(False, None, False, math.inf, math.inf), (True, 400, True, 0.5, 0.4)])
 def test_torch_checks_the_node(options, device):
     tensors = [leaf.detach().requires_grad_() for leaf in splats(device, torch.float32)]
-    arguments = [*tensors, torch.ones(2, device=device)], WIDTH, HEIGHT, *OPTIONS, *options
+    others = torch.ones(2, device=device), torch.ones(3, device=device)
+    arguments = [*tensors, *others], WIDTH, HEIGHT, *OPTIONS, *options
     checks = "test_schema", "test_faketensor"
     torch.library.opcheck(torch.ops.sehdr_warp.rasterize.default, arguments, test_utils=checks)
     rays = directions(device).float()

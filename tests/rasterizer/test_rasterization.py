@@ -24,14 +24,15 @@ def backward(rendering):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize("channels", [1, 3, 9])
-@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
-def test_matches_the_reference(device, dtype, channels, antialiased):
-    if antialiased and channels != 3:
-        pytest.skip("antialiasing does not look at the channels")
-    scene = random_scene(channels=channels)
+@pytest.mark.parametrize("option", ["plain", "antialiased", "order_axis"])
+def test_matches_the_reference(device, dtype, channels, option):
+    if option != "plain" and channels != 3:
+        pytest.skip("other options do not look at the channels")
+    scene, axis = random_scene(channels=channels), torch.tensor([0.6, -0.5, 0.8], dtype=dtype)
     ours, truth = scene.to(dtype, device), scene.to(torch.float64)
-    rendering = rasterize(*ours.arguments, antialiased=antialiased)
-    reference = rasterize_reference(*truth.arguments, antialiased=antialiased)
+    mine, true = {"antialiased": [True] * 2, "order_axis": [axis.to(device), axis.double()]}.get(option, [None] * 2)
+    rendering = rasterize(*ours.arguments, **({option: mine} if option != "plain" else {}))
+    reference = rasterize_reference(*truth.arguments, **({option: true} if option != "plain" else {}))
     value_bound, gradient_bound = BOUNDS[dtype]
     assert relative_error(rendering.image, reference.image) < value_bound
     assert relative_error(rendering.alpha, reference.alpha) < value_bound
@@ -40,6 +41,32 @@ def test_matches_the_reference(device, dtype, channels, antialiased):
     backward(reference)
     for name, tensor, true in zip(NAMES, ours.tensors, truth.tensors):
         assert relative_error(tensor.grad, true.grad) < gradient_bound, name
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_gaussians_are_ordered_along_any_axis(device, cameras):
+    """Of two at the sides of the image, the one that is in front changes with the axis; depths stay the camera's."""
+    scene = random_scene(count=2, channels=2, width=40, height=30).to(torch.float32, device)
+    means, pose = torch.tensor([[-0.05, 0.0, 4.0], [0.05, 0.0, 4.01]], device=device), torch.eye(4, device=device)
+    shape = [torch.full((2, 3), -1.0, device=device), *(tensor.detach() for tensor in scene.tensors[2:3])]
+    others = [*shape, torch.full((2,), 0.9, device=device), torch.eye(2, device=device)]
+    views = pose.expand(cameras, 4, 4), torch.tensor([40.0, 40.0, 20.0, 15.0], device=device).expand(cameras, 4)
+    views = views if cameras > 1 else [tensor[0] for tensor in views]
+
+    def weights(*axis):
+        axis = torch.tensor(axis, device=device) if axis else None
+        rendering = rasterize(means, *others, *views, 40, 30, order_axis=axis, depth=True)
+        assert torch.allclose(rendering.depths, means[:, 2])
+        assert (
+            3.9 < float(rendering.depth.reshape(cameras, 30, 40)[0, 15, 20] / rendering.alpha[..., 15, 20].max()) < 4.1
+        )
+        return rendering.image.reshape(cameras, 30, 40, 2)[-1, 15, 20].tolist()
+
+    assert weights() == weights(0.0, 0.0, 1.0) == weights(0.0, 0.9, 1.0)
+    assert weights()[0] > 5 * weights()[1]
+    first, second = weights(-0.3, 0.0, 1.0)
+    assert second > 5 * first
+    assert weights(1e30, 0.0, 0.0)[0] > 0.5  # Both at least at a thousandth of their depth
 
 
 def test_transmittance_keeps_its_digits_where_little_is_left(device):

@@ -1,12 +1,18 @@
-"""Gradient steps: which Gaussians DropGaussian leaves out of them."""
+"""Gradient steps: which Gaussians DropGaussian leaves out of them, and in which order they show Gaussians."""
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from sehdr_warp.model.gaussians import moments_of
-from sehdr_warp.training.gradient_step import Dropout
+from sehdr_warp.model.gaussians import Gaussians, moments_of
+from sehdr_warp.model.radiance_field import RadianceField
+from sehdr_warp.response import response_by_name
+from sehdr_warp.scene import Camera, Scene, View, codes_of
+from sehdr_warp.training.gradient_step import Dropout, OrderAxis
+from sehdr_warp.training.trainer import Trainer
 
-from .toy import VARIANTS, make_trainer, quick
+from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, quick
 
 ROWS = 100_000
 
@@ -58,3 +64,42 @@ def test_gaussians_that_are_nearly_opaque_are_left_out_too(scene):
     assert trainer.loss < 1
     squares = moments_of(trainer.optimizer, trainer.field.gaussians.harmonics_dc)["exp_avg_sq"]
     assert 0 < float(squares.any(1).float().mean()) < 0.6
+
+
+def test_an_axis_depends_on_seed_and_iteration_alone_and_keeps_its_memory(device):
+    def axis(seed: int, *iterations: int) -> list[float]:
+        order = OrderAxis(30.0, seed, torch.device(device))
+        addresses = set()
+        for iteration in iterations:
+            order.draw(iteration)
+            addresses.add(order.axis.data_ptr())
+        assert len(addresses) == 1 and float(order.axis[2]) == 1 and float(order.axis[:2].abs().max()) <= 0.5774
+        return order.axis.tolist()
+
+    assert axis(1, 600, 700) == axis(1, 700)
+    assert len({tuple(axis(seed, n)) for seed, n in ((1, 700), (2, 700), (1, 701), (2**62, 5))}) == 4
+    slopes = torch.tensor([axis(3, n)[:2] for n in range(200)])
+    assert float(slopes.abs().max()) > 0.5 and float(slopes.mean(0).abs().max()) < 0.08
+
+
+@pytest.mark.parametrize("angle", [0.0, 25.0])
+def test_a_turned_camera_shows_what_photos_from_its_place_show(angle):
+    """A wall hides a light right behind it, which is in front of the wall for a camera that is turned aside."""
+    means, logarithms = torch.tensor([[0.0, 0.0, 4.0], [1.5, 0.0, 4.02]]), torch.tensor([[-1.0] * 3, [2.0] * 3])
+    gaussians = Gaussians.from_points(means, logarithms, 0, opacity=0.999, scale=1.0)
+    gaussians.log_scales.data.fill_(1.5)
+    field = RadianceField(gaussians, response_by_name("srgb"), base_time=EXPOSURE_TIME)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("y", 15, degrees=True).as_matrix()
+    camera, turned = (Camera(24, 24, 24.0, 24.0, 12.0, 12.0, pose) for pose in (np.eye(4), turn))
+    codes = codes_of(field.render_ldr(camera).numpy(), 8)
+    views = tuple(View(name, codes, camera, EXPOSURE_TIME, "train") for name in "ab")
+    scene = Scene("wall", "transforms", views, means.double().numpy(), np.ones((2, 3), np.float32))
+    times = {"densification.refine_start_iter": 1000, "densification.refine_stop_iter": 1001, "schedule.ema_window": 0}
+    rates = {"optimizer.means": 1e-9, "optimizer.means_final": 1e-9, "optimizer.harmonics_dc": 0.03}
+    trainer = Trainer(scene, quick(length=200, **times, **rates, **{"model.order_angle": angle}), field)
+    for _ in range(200):
+        trainer.step()
+    wall, aside = (float(field.render(each).hdr[12, 12].mean()) for each in (camera, turned))
+    assert wall == pytest.approx(1.5, rel=0.3)
+    assert aside < 4 * wall if angle else aside > 15 * wall
