@@ -95,7 +95,8 @@ def write_brackets(
 
     Args:
         out: Folder for the files.
-        views: Name -> [H, W, 3] scene-linear Rec.709 radiance, >= 0, not multiplied by an exposure time.
+        views: Name -> [H, W, 3] scene-linear Rec.709 radiance, >= 0, not multiplied by an exposure time. Files of a
+            repeated name get a number.
         base_time: Seconds at 0 EV.
         evs: Stops, such as "-4,-2,0" or [-4, -2, 0]. Set either evs or exposures.
         exposures: Seconds, stops or multiples of the base time, such as "1/125, -2ev, 8x"; numbers are seconds.
@@ -122,9 +123,9 @@ def write_brackets(
         response=response,
         group_by=group_by,
     )
-    radiances = dict(views)
+    radiances = list(views.items() if isinstance(views, Mapping) else views)
     with writer.open(overwrite):
-        for file_name, (name, radiance) in zip(safe_names(list(radiances)), radiances.items(), strict=True):
+        for file_name, (name, radiance) in zip(safe_names([name for name, _ in radiances]), radiances, strict=True):
             writer.write(file_name, radiance, (cameras or {}).get(name))
     if overwrite and ldr is None:
         remove_earlier(writer.out, ["brackets_ldr"])

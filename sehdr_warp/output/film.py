@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -192,7 +193,9 @@ def film_format(out: Path | str) -> str:
 
 
 def check_rate(fps: float) -> None:
-    """Raise SehdrError for frames a second that no film has."""
+    """Raise TypeError for what is no number, and SehdrError for frames a second that no film has."""
+    if not isinstance(fps, Real):
+        raise TypeError(f"fps is {fps!r:.60}, expected a number")
     if not _SLOWEST <= fps <= _FASTEST:
         raise SehdrError(f"{fps} frames a second are not between {_SLOWEST} and {_FASTEST}")
 

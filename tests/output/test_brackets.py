@@ -83,6 +83,14 @@ def test_manifest_lists_what_was_written(tmp_path):
         assert float(spec.get_string_attribute("sehdr:ev")) == exposure["ev"]
 
 
+def test_views_of_one_name_are_all_written(tmp_path):
+    images = radiance(), radiance(seed=1)
+    files = write_brackets(tmp_path, iter([("r_0", image) for image in images]), 0.5, evs=[0], pixel="float")
+    assert [file.name for file in files] == ["r_0_b0_ev+0.0.exr", "r_0_2_b0_ev+0.0.exr"]
+    for file, image in zip(files, images, strict=True):
+        np.testing.assert_allclose(read_exr(file)[0], image / 2, rtol=1e-6)
+
+
 def test_multipart_holds_all_exposures_of_a_view(tmp_path):
     image = radiance()
     files = write_brackets(tmp_path, {"r_0": image, "r_1": image}, 0.5, evs=[-1, 0, 1], multipart=True)

@@ -134,6 +134,12 @@ def test_rates_that_no_film_has_are_refused(tmp_path, fps):
             run_render(Render(run=tmp_path, out=tmp_path / "o", cameras="orbit", film=FilmOptions(fps=fps), **films))
 
 
+@pytest.mark.parametrize("fps", ["24", None, [24.0]])
+def test_a_rate_that_is_no_number_is_named(tmp_path, fps):
+    with pytest.raises(TypeError, match="fps is .*, expected a number"):
+        write_film(AnalyticRun(), tmp_path / "f.mp4", [AnalyticRun().cameras[0].camera], fps=fps)
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_hevc_films_of_one_or_two_frames_need_no_clean_memory(tmp_path, count):
     """Write in a process whose new memory is not zero: x265 takes decoding times of so few frames from it."""
