@@ -101,6 +101,23 @@ def edits_of(request: dict, photos: Callable[[], Sequence[View]]) -> SplatEdits 
     return SplatEdits(**edits) if edits else None
 
 
+def history_of(request: dict) -> list[dict]:
+    """Return the edits that a page can undo, the newest last; raise SehdrError for values that no page draws."""
+    history = request.get("history", [{}])
+    if not (isinstance(history, list) and history and all(isinstance(edits, dict) for edits in history)):
+        raise SehdrError("history is not a list of edits")
+    for name, value in (item for edits in history for item in edits.items()):
+        if isinstance(value, dict):
+            points = np.array(value.get("points"), np.float64)
+            drawn = value.get("shape") in ("sphere", "box") and points.shape == (2, 3) and np.isfinite(points).all()
+        else:
+            numbers = value if isinstance(value, list) else [value]
+            drawn = all(isinstance(number, int | float) for number in numbers)
+        if not drawn:
+            raise SehdrError(f"history: {name:.40} is not an edit")
+    return history
+
+
 def orient(run: Any, request: dict) -> None:
     """Keep with a run the up direction or the scale that a page sets; raise SehdrError for values that cannot be."""
     up, scale = request.get("up"), request.get("scale")

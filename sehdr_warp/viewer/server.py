@@ -31,7 +31,7 @@ from ..output.scene_page import write_scene_page
 from ..scene import Camera
 from .clients import ClientRun, Refusal, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
-from .edits import edits_of, orient
+from .edits import edits_of, history_of, orient
 from .renderer import Renderer
 from .viewer_scene import ViewerScene, camera_file, camera_of, frame_bytes
 
@@ -118,7 +118,8 @@ class Viewer:
     def _edit(self, request: dict, client: Connection) -> Answer:
         edits = edits_of(request, partial(self._photos_of, int(request.get("run", 0))))
         merged = [self._run_of({"run": index}) for index in request.get("merge", ())]
-        return self._change(request, client, lambda run: run.edit(edits, merged))
+        history = history_of(request)
+        return self._change(request, client, lambda run: run.edit(edits, merged, history))
 
     def _orient(self, request: dict, client: Connection) -> Answer:
         return self._change(request, client, partial(orient, request=request))

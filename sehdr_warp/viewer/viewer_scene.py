@@ -45,6 +45,7 @@ class ViewerScene:
         self._own = run, clipped
         self.lock, self.version = SceneLock(), 0
         self._opened: list[dict[str, Any]] = []
+        self.history: list[dict[str, Any]] = [{}]  # Edits that a page can undo, as pages draw them, the newest last
         self._start_edits()
 
     def _start_edits(self) -> None:
@@ -60,6 +61,7 @@ class ViewerScene:
         with self.lock.changing():
             self.run, self.clipped = self._own = run, clipped
             self._start_edits()
+            self.history = [{}]
             self.version += 1
 
     def lights(self) -> list[Light]:
@@ -95,11 +97,14 @@ class ViewerScene:
         ]
         return {"lights": rows, "unit": luminance_of_one(self.run)}
 
-    def edit(self, edits: SplatEdits | None, merged: Sequence["ViewerScene"] = ()) -> None:
+    def edit(
+        self, edits: SplatEdits | None, merged: Sequence["ViewerScene"] = (), history: Sequence[dict[str, Any]] = ({},)
+    ) -> None:
         """Show what edits leave of the scene and of scenes that are merged with it, or all of them for None.
 
         Gains of lights end when other scenes are merged, because the lights are others. Raises SehdrError if nothing is
         left, a merged scene is this one or has edits, or merge_scenes() refuses it; what is shown then stays.
+        `history` is what pages know these edits by.
         """
         for other in merged:
             if other is self or other.visible_count is not None:
@@ -112,6 +117,7 @@ class ViewerScene:
             except SehdrError:
                 self._show(*before)
                 raise
+            self.history = list(history)
             self.version += 1
 
     def _show(self, edits: SplatEdits | None, merged: tuple["ViewerScene", ...]) -> None:
@@ -203,6 +209,7 @@ class ViewerScene:
             "scene": self.scene_name,
             "gaussians": self.gaussian_count if self.visible_count is None else self.visible_count,
             "edited": self.visible_count is not None,
+            "history": self.history,
             "merged": len(self._merged),
             "iterations": self.iterations,
             "response": self.response.name,

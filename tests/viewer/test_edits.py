@@ -227,6 +227,40 @@ def test_undo_goes_back_one_edit_at_a_time(server):
         assert page.inner_text("#distance") == "2.00 m"
 
 
+def test_pages_of_one_server_share_edits_and_undo(server):
+    with browser() as chromium, page_of(chromium, server.url) as one, page_of(chromium, server.url) as other:
+
+        def until_told(page, count, words):
+            until(page, f"facts.gaussians === {count} && $('edited').textContent.includes('{words}')")
+
+        for page in (one, other):
+            page.wait_for_selector("#stage[data-frame=full]")
+        one.click("#floaters")
+        until_told(one, 2, "--min-views 2")
+        other.evaluate("state.points = [[1, 0, 0], [1.2, 0, 0]], measured()")
+        other.click("#cut")  # At once, or when the page has seen the other's edit
+        until_told(other, 1, "--min-views 2 --cut sphere:")
+        until_told(one, 1, "--min-views 2 --cut sphere:")
+        one.reload()
+        one.wait_for_selector("#stage[data-frame=full]")
+        assert "--min-views 2 --cut sphere:" in one.inner_text("#edited")
+        one.click("#undo")
+        until_told(one, 2, "part.ply --min-views 2")
+        other.click("#undo")
+        until_told(other, 2, "all of it is shown")
+        until_told(one, 2, "all of it is shown")
+        assert server.viewer.runs[0].facts()["history"] == [{}]
+
+
+@pytest.mark.parametrize(
+    "history", ["cut", [], ["cut"], [{"cut": "ball"}], [{"cut": {"shape": "ball", "points": [[0] * 3] * 2}}],
+                [{"cut": {"shape": "box", "points": [[0] * 3]}}], [{"merge": ["0"]}]]
+)  # fmt: skip
+def test_edits_that_no_page_draws_are_refused(server, history):
+    assert edit(server, min_views=2, history=history)[0] == 409
+    assert server.viewer.runs[0].facts()["history"] == [{}]
+
+
 @pytest.fixture
 def two_runs(tmp_path):
     """A viewer of two runs in the same coordinates, of two Gaussians and one."""

@@ -39,6 +39,7 @@ async function start() {
   useRun(0);
   new ResizeObserver(resize).observe(stage);
   home();
+  if (facts.history.length > 1) note(described());
 }
 // The path of a run without the folders that all runs share.
 function label(run) {
@@ -63,8 +64,10 @@ async function renew() {
     if (versions.every((version, i) => version === runs[i].version)) return;
     const answer = await (await ask("scene")).json(), views = all => JSON.stringify(all.map(run => run.views));
     if (views(answer.runs) !== views(runs)) return location.reload();  // Another scene
+    const edits = JSON.stringify(facts.history);
     runs = answer.runs;
     useRun(state.run);
+    if (JSON.stringify(facts.history) !== edits) note(described());  // By another page
     request(false);
   } catch (error) { tell(error.message); }
 }
@@ -380,8 +383,7 @@ function fly(now) {
 
 // Points that are picked measure lengths, set scale and up, and crop
 const upright = point => { const m = facts.upright; return m ? [0, 1, 2].map(i => dot(m[i].slice(0, 3), point) + m[i][3]) : point; };
-state.points = [], state.regions = {};
-const regions = () => state.regions[state.run] ||= [{}];  // Of the run; the last one is shown, and Undo goes back by one
+state.points = [];
 function pick(place) {
   const point = pointAt(place);
   if (!point) return note("nothing is there to pick");
@@ -445,12 +447,13 @@ function region({shape, points}) {
   const values = shape === "box" ? [...a.map(x => x - half), ...a.map(x => x + half)] : [...a, Math.hypot(...offsets)];
   return `${shape}:${values.map(x => x.toPrecision(5)).join(",")}`;
 }
-let editing = Promise.resolve();  // One edit after the other: a refused one takes back its own
+let editing = Promise.resolve();  // One edit after the other
 const queued = change => { editing = editing.then(change); };
+// The server has the edits of the run, for all of its pages: the last one is shown, and Undo goes back by one.
 async function put(part) {
-  regions().push({...regions().at(-1), ...part});
-  if (!await edit()) regions().pop();  // As where nothing would be left
-  offer();
+  note("\u2026");
+  await renew();
+  return edit([...facts.history, {...facts.history.at(-1), ...part}]);
 }
 for (const name of ["crop", "cut"]) $(name).addEventListener("click", () => {
   const drawn = {shape: $("shape").value, points: [...state.points]};
@@ -462,24 +465,27 @@ $("faint").addEventListener("change", () => queued(() => put({min_opacity: Numbe
 $("merge").addEventListener("change", () => {
   const index = Number($("merge").value);
   $("merge").value = "";
-  queued(() => put({merge: [...regions().at(-1).merge || [], index]}));
+  queued(() => put({merge: [...facts.history.at(-1).merge || [], index]}));
 });
 // Shows what is left to choose after an edit.
 function offer() {
-  const {min_opacity, merge} = regions().at(-1);
+  const {min_opacity, merge} = facts.history.at(-1);
   $("faint").value = min_opacity || 0;
   [...$("merge").options].slice(1).forEach((option, i) => { option.disabled = i === state.run || (merge || []).includes(i); });
 }
-$("undo").addEventListener("click", () => queued(() => {
-  if (regions().length > 1) regions().pop();
-  offer();
-  return edit();
+$("undo").addEventListener("click", () => queued(async () => {
+  note("\u2026");
+  await renew();
+  return edit(facts.history.length > 1 ? facts.history.slice(0, -1) : [{}]);
 }));
-function edit() {
-  const edits = Object.fromEntries(Object.entries(regions().at(-1)).map(([name, value]) => [name, value.points ? region(value) : value]));
+const asOptions = edits => Object.fromEntries(Object.entries(edits).map(([name, value]) => [name, value.points ? region(value) : value]));
+async function edit(history) {
+  if (!await change("edit", {...asOptions(history.at(-1)), history}, described)) offer();  // As where nothing would be left
+}
+function described() {
   const words = value => value === true ? "" : " " + (Array.isArray(value) ? value.map(i => runs[i].argument).join(" ") : value);
-  const flags = Object.entries(edits).map(([name, value]) => ` --${name.replace("_", "-")}` + words(value)).join("");
-  return change("edit", edits, () => flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.argument} --out part.ply${flags}` : "all of it is shown");
+  const flags = Object.entries(asOptions(facts.history.at(-1))).map(([name, value]) => ` --${name.replace("_", "-")}` + words(value)).join("");
+  return flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.argument} --out part.ply${flags}` : "all of it is shown";
 }
 measured();
 
