@@ -12,6 +12,7 @@ from ..scene import Camera
 SURFACE = 2.0  # Times white, below which light that darker photos measure, with its deviation, is that of a surface
 MEASURED_STOPS = 0.25  # Deviation of light that a darker photo shows unclipped: surfaces are lit within 7 to 19 % then
 EXPECTED_CLIPPED = 0.9  # Of the share that clips if the scene is right, from which the darkest photos' white is certain
+SPREAD = 3**0.5  # Deviations from the mean of an even distribution to its end
 DARKEST_CLIPPED = 0.5  # Of the share that the darkest photos show, which clips there too
 
 
@@ -36,6 +37,7 @@ class Photos:
     whites: np.ndarray  # [V] radiance that each photo clips at
     pixels: Tensor  # [N] sums over the photos
     radiance: Tensor  # [N, 3] mean towards the photos
+    brightness: Tensor  # [N, 2] means of the brightness of the pixels that show each, and of its square
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,7 @@ class Candidates:
         doubt: [K] stops of its confidence.
         angles: [V, K] solid angles that photos see.
         light: [V, K, 3] radiance times these.
+        pixel_brightness: [K, 2] means of the brightness of the pixels that show it, and of its square.
     """
 
     index: Tensor
@@ -71,6 +74,7 @@ class Candidates:
     doubt: np.ndarray
     angles: np.ndarray
     light: np.ndarray
+    pixel_brightness: np.ndarray
 
     @property
     def longest(self) -> np.ndarray:
@@ -85,6 +89,15 @@ class Candidates:
         others = {name: value for name, value in vars(self).items() if name not in parts}
         parts |= {name: None if value is None else value[rows] for name, value in others.items()}
         return Candidates(**parts)
+
+
+def brightest_in_photos(group: Candidates) -> float:
+    """Return the brightness that photos show of a light where it is brightest: a faint Gaussian is brighter than that.
+
+    Of a blurred point of light, as much light is in dim as in bright pixels, up to SPREAD deviations above the mean.
+    """
+    mean, square = np.average(group.pixel_brightness, axis=0, weights=group.weights)
+    return float(mean + SPREAD * np.sqrt(max(square - mean**2, 0.0)))
 
 
 def is_surface(group: Candidates, white: float) -> bool:

@@ -15,7 +15,15 @@ from ..scene.wide_camera import pixels_of_directions, steradians, typical_focal_
 from ..subsets import every_nth
 from .confidence import RESIDUAL_WEIGHT
 from .gaussians import rotate
-from .light_evidence import Candidates, Photos, ReceivedLight, certain_radiance, deviation_of_light, is_surface
+from .light_evidence import (
+    Candidates,
+    Photos,
+    ReceivedLight,
+    brightest_in_photos,
+    certain_radiance,
+    deviation_of_light,
+    is_surface,
+)
 from .light_shapes import LightShape, connected_groups, fit_solid_angles, fitted_shape, solid_angles
 from .radiance_field import RadianceField
 
@@ -39,8 +47,8 @@ class Light:
     Attributes:
         shape: its place and size.
         radiance: [3] in the field's colors; with the shape it gives the light that training views show, of those
-            from which nothing hides it. If each view cuts the light off at its border, it is what reaches the place of
-            the one that shows most of it.
+            from which nothing hides it, and is no brighter than their pixels. If each view cuts the light off at its
+            border, it is what reaches the place of the one that shows most of it.
         lower_bound: [3] certain radiance: the white of the darkest photos that clip it, or less where it has less of a
             color.
         deviation: of log2 radiance, stops, of what photos clip; None if that was not measured. Edges and colors that do
@@ -145,6 +153,9 @@ def find_lights(
         area = float(fit_solid_angles(shape, light_photos.angles[:, None], places)[0])
         # As large as it looks: the pixels of the photos blur small lights, and Gaussians reach beyond their centers.
         shape = shape.with_area(min(max(area, 1e-4), 1e4))
+        # No brighter than pixels, which show faint Gaussians and what is behind them: the same light of a larger area.
+        excess = fit_solid_angles(shape, light_photos.light, places).mean() / max(brightest_in_photos(group), 1e-30)
+        shape = shape.with_area(min(max(excess, 1.0), 1e4))
         radiance = fit_solid_angles(shape, light_photos.light, places)
         if radiance.mean() * shape.solid_angle(middle) < LEAST_SHARE * total:
             continue
@@ -188,18 +199,22 @@ def _measure_photos(
     most = field.response.white / float(np.quantile(times, 0.75, method="lower"))
     white = _reference_white(np.minimum(whites, most), radiance.amax(1), pixels)
     measured, of_all = torch.zeros_like(pixels), torch.full_like(pixels, 1e-12)
+    brightness = pixels.new_zeros(len(pixels), 2)
     counts = np.repeat([len(part) / max(1, len(some)) for part, some in zip(parts, samples)], [*map(len, samples)])
     unclipped = torch.zeros(len(cameras), len(pixels), dtype=torch.bool, device=pixels.device)
     for index, (camera, limit, each, count) in enumerate(zip(cameras, whites, received, counts, strict=True)):
         of_all += count * each.pixels
+        image = field.render(camera, degree=degree).hdr.to(pixels.device)
+        brightness += _brightness_by(field, camera, image)
         if limit >= 2 * white:
-            below_white = _unclipped_by(field, camera, limit, degree)
+            below_white = _unclipped_by(field, camera, image, limit)
             measured += count * below_white
             unclipped[index] = below_white > 0
     agree = 1 - clipped.to(measured.device) > measured / of_all / 2  # Photos clip, too, where the scene is too dark.
     measured = (measured > LEAST_MEASURED) & agree
     focal = typical_focal_length(cameras)
-    return Photos(cameras, received, white, unclipped, measured, focal, whites, pixels, radiance)
+    brightness /= pixels.clamp_min(1e-20)[:, None]
+    return Photos(cameras, received, white, unclipped, measured, focal, whites, pixels, radiance, brightness)
 
 
 def _candidates(field: RadianceField, clipped: Tensor, photos: Photos) -> Candidates:
@@ -231,6 +246,7 @@ def _candidates(field: RadianceField, clipped: Tensor, photos: Photos) -> Candid
         doubt=-confidence[index].clamp_min(2.0**-8).log2().cpu().numpy(),
         angles=np.stack([each.angles[index].cpu().numpy() for each in photos.received]),
         light=np.stack([each.light[index].cpu().numpy() for each in photos.received]),
+        pixel_brightness=photos.brightness[index].cpu().numpy(),
     )
 
 
@@ -282,13 +298,19 @@ def _received_by(
     return ReceivedLight(sums[:, 0], sums[:, 1] * unit, radiance * (sums[:, 1:] * unit))
 
 
-def _unclipped_by(field: RadianceField, camera: Camera, white: float, degree: int | None) -> Tensor:
+def _brightness_by(field: RadianceField, camera: Camera, image: Tensor) -> Tensor:
+    """Return sums [N, 2] of the brightness of the pixels [H, W, 3] of a camera, and of its square."""
+    mean = image.mean(2)
+    return field.weighted_sums(field.camera_tensors(camera), torch.stack([mean, mean**2], 2))
+
+
+def _unclipped_by(field: RadianceField, camera: Camera, image: Tensor, white: float) -> Tensor:
     """Return the pixels [N] of each Gaussian that a camera shows, 0 if most of them are as bright as its white.
 
-    A Gaussian that blends with darker ones may be brighter than all pixels.
+    A Gaussian that blends with darker ones may be brighter than all pixels, which `image` [H, W, 3] is a render of.
     """
-    image = field.render(camera, degree=degree).hdr.amax(2).to(field.gaussians.means.device)
-    images = torch.stack([torch.ones_like(image), (image < white).to(image)], 2)
+    brightest = image.amax(2)
+    images = torch.stack([torch.ones_like(brightest), (brightest < white).to(brightest)], 2)
     pixels, unclipped = field.weighted_sums(field.camera_tensors(camera), images).unbind(1)
     return torch.where(unclipped > pixels / 2, pixels, 0)
 

@@ -165,6 +165,7 @@ def group_of(radiance, unclipped, **values):
     fields |= {"weights": radiance.mean(0), "brightness": radiance.max(0), "too_bright": np.ones(count, bool)}
     fields |= {"measured": unclipped.any(0), "unclipped": unclipped, "clipped": np.full(count, 0.8)}
     fields |= {"stops": np.full(count, 1.6), "doubt": np.full(count, 1.6), "angles": np.ones_like(radiance)}
+    fields |= {"pixel_brightness": np.ones((count, 2))}
     return Candidates(**fields | {"light": radiance[..., None] * [0.5, 1.0, 0.2]} | values)
 
 

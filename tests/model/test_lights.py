@@ -233,3 +233,17 @@ def test_photos_so_dark_that_lights_do_not_clip_take_none_off_the_list():
     two_dark = [(camera, time / (64 if i < 2 else 1)) for i, (camera, time) in enumerate(views())]
     (light,) = find_lights(scene, clipped, two_dark)
     assert len(light.members) == scene.gaussians.count
+
+
+def test_a_light_of_faint_gaussians_is_as_bright_as_its_pixels():
+    """Each is ten times as bright as any pixel, whatever lies behind it."""
+    places = np.concatenate([panel(), panel(3, 3, at=(0, 0, 4.2))])
+    radiance = np.where(places[:, 2:] < 4.1, 400, 0.03) * np.ones(3)
+    scene = field(places, radiance, 0.03)
+    lamp = torch.from_numpy(places[:, 2] < 4.1)
+    scene.gaussians.opacity_logits.data[lamp] = -4
+    cameras = views()
+    (light,) = find_lights(scene, lamp.float(), cameras)
+    shown = max(float(scene.render(camera).hdr.max()) for camera, _ in cameras)
+    assert shown < 100 and light.radiance.mean() == pytest.approx(shown, rel=0.2)
+    assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.1)
