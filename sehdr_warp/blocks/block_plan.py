@@ -21,7 +21,7 @@ from ..errors import InputError, SehdrError
 from ..files import read_json, refuse_links, write_json
 from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
-from ..runs.config_files import config_from_dict, field_and_problem, override_config
+from ..runs.config_files import config_of_run, field_and_problem, override_config
 from ..runs.open import load_scene_and_log_notes, response_for_loading
 from ..runs.scene_description import SFM_LAYOUTS, in_world_of_run
 from ..runs.values import DataValues, GainValues, LoadArguments, NormalizationValues
@@ -189,7 +189,7 @@ class BlockPlan:
             raise InputError(path, str(error), remedy) from None
         if values["format"] != FORMAT:
             raise InputError(path, f"is of format {values['format']}, not {FORMAT}", remedy)
-        compensation, config = values["exposure_compensation"], config_from_dict(values["config"], path)
+        compensation, config = values["exposure_compensation"], config_of_run(values["config"], path)
         shared = SharedDecisions(
             values["base_time"],
             None if compensation is None else ExposureCompensation.from_dict(compensation),

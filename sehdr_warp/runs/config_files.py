@@ -28,6 +28,8 @@ _GONE = tomllib.loads((resources.files("sehdr_warp.runs") / "gone.toml").read_te
 RENAMED: dict[str, str] = _GONE.pop("renamed")  # Fields of version 0.2, each with its name since version 0.3
 GONE: dict[str, str] = {path: advice for advice, paths in _GONE.items() for path in paths}
 """Fields of earlier versions that no longer exist, each with what to do instead."""
+ADDED: dict[str, Any] = {"model.order_angle": 0.0}
+"""Fields that runs of earlier versions lack, each with the value that these were trained by."""
 _RENAMED_VALUES = {"densification.strategy": {"relocation": "mcmc", "gradient": "adc"}}
 
 
@@ -169,10 +171,15 @@ def config_from_dict(values: dict, source: Path | str = "config", flags: Mapping
 
 
 def config_of_run(values: dict, file: Path) -> Config:
-    """Return config_from_dict() of a run's values; a field that is gone is left out with a warning, not refused.
+    """Return config_from_dict() of a run's values, of an earlier version too, which goes on as it began if it can.
 
-    The run was trained with it, and its checkpoint states the hash of its file, so nobody can leave it out there.
+    A field that is gone is left out with a warning, not refused: the run was trained with it, and its checkpoint states
+    the hash of its file, so nobody can leave it out there.
     """
+    for path, value in ADDED.items():
+        part, _, name = path.rpartition(".")
+        if isinstance(table := values.get(part), dict):
+            values = values | {part: {name: value} | table}
     for path in GONE:
         part, _, name = path.rpartition(".")
         if isinstance(table := values.get(part), dict) and table.get(name):
