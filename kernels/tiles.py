@@ -107,12 +107,16 @@ def tile_kernels(dtype) -> SimpleNamespace:
         range_start: int,
         means2d: vec2s, depths: reals, intrinsics: vec4s, axis: wp.array(dtype=vec3), along: reals,
     ):
-        """Write depths along the axis, in the camera's coordinates: positive, at least a thousandth of the depths."""
+        """Write depths along the axis, in the camera's coordinates: positive, at least a thousandth of the depths.
+
+        The axis may have any length: its largest component counts as 1.
+        """
         i = range_start + wp.tid()
         pinhole = intrinsics[0]
         mean = means2d[i]
         ray = vec3((mean[0] - pinhole[2]) / pinhole[0], (mean[1] - pinhole[3]) / pinhole[1], real(1.0))
-        along[i] = depths[i] * wp.max(wp.dot(ray, axis[0]), real(0.001))
+        largest = wp.max(wp.abs(axis[0]))
+        along[i] = depths[i] * wp.max(wp.dot(ray, axis[0] / largest), real(0.001))
 
     @wp.kernel(module="unique", module_options=options)
     def key_by_depth(

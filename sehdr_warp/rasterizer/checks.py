@@ -144,6 +144,12 @@ def check_position(position: Tensor) -> None:
         raise ValueError(f"position is {numbers}, expected finite numbers")
 
 
+def check_order_axis(axis: Tensor) -> None:
+    """Raise ValueError for an axis [3] on the CPU that has no direction."""
+    if axis.device.type == "cpu" and not (all(map(math.isfinite, numbers := axis.detach().tolist())) and any(numbers)):
+        raise ValueError(f"order_axis is {numbers}, expected finite numbers that are not all 0")
+
+
 def check_directions(directions: Tensor) -> None:
     """Raise ValueError for directions [..., 3] that require a gradient, or on the CPU are not finite unit vectors."""
     if directions.requires_grad and torch.is_grad_enabled():

@@ -90,9 +90,16 @@ def _as_float(*tensors: Tensor) -> list[Tensor]:
     return [tensor.float() if half else tensor for tensor, half in zip(tensors, halves, strict=True)]
 
 
+_NONE = 0, 0, 0, 0  # Shape of a tensor in the place of None
+
+
+def _optional(tensor: Tensor) -> Tensor | None:
+    return None if tensor.ndim == len(_NONE) and not tensor.numel() else tensor
+
+
 def _run_rasterize(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
     arguments: Any = tensors[:7]
-    background, order_axis = (tensor if tensor.numel() else None for tensor in tensors[7:])
+    background, order_axis = map(_optional, tensors[7:])
     others: Any = {"background": background, "order_axis": order_axis}
     rendering = rasterize(*arguments, **others, **RenderOptions(*options)._asdict())
     results = [rendering.image, rendering.transmittance, rendering.means2d, rendering.depths, rendering.extents]
@@ -101,7 +108,7 @@ def _run_rasterize(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
 
 
 def _fake_rasterize(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
-    check_shapes(GaussiansAndCamera(*tensors[:7]), *(tensor if tensor.numel() else None for tensor in tensors[7:]))
+    check_shapes(GaussiansAndCamera(*tensors[:7]), *map(_optional, tensors[7:]))
     options = RenderOptions(*values)
     height, width = options.height, options.width
     means, features, pose = tensors[0], tensors[4], tensors[5]
@@ -146,7 +153,7 @@ def compiled_rasterize(
     """Do what rasterize() does, as a custom operator. The number of intersections is 0 without max_intersections."""
     cameras = len(world_to_camera) if world_to_camera.ndim == 3 else 1
     tensors = [means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics]
-    tensors += [means.new_empty(0) if tensor is None else tensor for tensor in (background, order_axis)]
+    tensors += [means.new_empty(_NONE) if tensor is None else tensor for tensor in (background, order_axis)]
     options = RenderOptions(width, height, **others)
     results = _rasterize_op(_as_float(*tensors), *options)
     image, transmittance, means2d, depths, extents = results[:5]

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE
 from .absolute_gradient import watch_absolute_gradients
 from .blending import blend, with_gradient
-from .checks import check_cameras, check_channels, check_opacities, check_tensors
+from .checks import check_cameras, check_channels, check_opacities, check_order_axis, check_tensors
 from .cuda_graphs.cache import GraphInUse, GraphPool, checked_pool, pool_for
 from .memory import oom_context
 from .projection import GaussiansAndCamera, ProjectedGaussians, Splats2D, project_to_camera
@@ -107,8 +107,8 @@ def rasterize(
     """Rasterize Gaussians with any number of feature channels to images of cameras (3DGS, Kerbl et al. 2023).
 
     All tensors share one device (CPU or CUDA) and one dtype (float32 or float64). Differentiable once with respect to
-    every tensor, camera included; the graph can be retained. The factor that antialiased=True multiplies opacities by
-    is constant in these gradients. On the CPU results repeat bit for bit, whatever the number of threads.
+    every tensor but order_axis, camera included; the graph can be retained. The factor that antialiased=True multiplies
+    opacities by is constant in these gradients. On the CPU results repeat bit for bit, whatever the number of threads.
 
     A Gaussian with a parameter or feature that is not finite is culled: it contributes nothing, and its gradients are
     0. On a GPU a camera that is not finite culls all; on the CPU it is refused.
@@ -142,14 +142,15 @@ def rasterize(
             image beyond its border, as in 3DGS. For an image that is wider than those that the Gaussians were trained
             on, the limit of these keeps Gaussians beside them from reaching into the middle.
         ray_limit_y: likewise y/z.
-        order_axis: [3] in the camera's coordinates, along which Gaussians are ordered by depth; by default (0, 0, 1),
-            the camera's own axis. A Gaussian that is not in front along it is first.
+        order_axis: [3] of any length, in the camera's coordinates, along which Gaussians are ordered by depth; by
+            default (0, 0, 1), the camera's own axis. A Gaussian that is not in front along it is first. On a GPU such
+            calls are launched, and not replayed as CUDA graphs.
 
     Raises:
         TypeError: if an argument is not a tensor or not an integer.
         ValueError: if a shape, dtype, device or option does not fit; on the CPU also for opacities outside of [0, 1]
             and for a camera that is not finite, cannot be inverted, is transposed or has a focal length that is not
-            positive.
+            positive, and for an order_axis that is not finite or 0.
         NotImplementedError: within torch.func and for forward-mode differentiation.
         RuntimeError: while a CUDA graph is captured without max_intersections.
         OutOfMemory: (a SehdrError) with the sizes, if memory does not suffice.
@@ -164,6 +165,8 @@ def rasterize(
         check_shapes(tensors, background, order_axis)
         check_opacities(opacities)
         check_cameras(world_to_camera, intrinsics)
+        if order_axis is not None:
+            check_order_axis(order_axis)
         options = options.checked(means.device)
     try:
         if world_to_camera.ndim == 2:

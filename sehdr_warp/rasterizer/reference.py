@@ -118,7 +118,7 @@ def rasterize_reference(
     order_depths = depths
     if order_axis is not None:
         center = means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-        order_depths = torch.maximum(center @ order_axis, 0.001 * depths)
+        order_depths = torch.maximum(center @ (order_axis / order_axis.abs().max()), 0.001 * depths)
     image, transmittance = blend_reference(
         means2d, conics, opacities, features, order_depths, extents, width, height, alpha_threshold, transmittance_min
     )

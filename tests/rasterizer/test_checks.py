@@ -69,6 +69,8 @@ def with_nan_and_logits(opacities):
         ("depth", lambda _: 1, TypeError, "depth is 1, expected True or False"),
         ("order_axis", lambda _: torch.eye(3).double(), ValueError, r"order_axis has shape \[3, 3\], expected \[3\]"),
         ("order_axis", lambda _: torch.ones(3), ValueError, "order_axis is torch.float32 on cpu, but means is"),
+        ("order_axis", lambda _: torch.zeros(3).double(), ValueError, r"order_axis is \[0.0, 0.0, 0.0\], exp"),
+        ("order_axis", lambda _: torch.eye(3)[0].double() / 0, ValueError, r"order_axis is \[inf, nan, nan\], exp"),
         ("order_axis", lambda _: (0, 0, 1), TypeError, "order_axis is a tuple, expected a torch tensor"),
     ],
 )

@@ -66,6 +66,13 @@ def test_an_operation_compiles_by_itself_after_programs_that_do_not():
     assert torch.equal(compiled.image, rasterize(*arguments).image)
 
 
+@pytest.mark.parametrize("name", ["background", "order_axis"])
+def test_a_compiler_refuses_an_empty_option_too(name):
+    arguments = *splats(dtype=torch.float32, channels=3), WIDTH, HEIGHT
+    with pytest.raises(Exception, match=rf"{name} has shape \[0\], expected"):
+        torch.compile(rasterize, backend="aot_eager")(*arguments, **{name: torch.zeros(0)})
+
+
 OPTIONS = 0.01, 0.3, 1e-3, False
 
 

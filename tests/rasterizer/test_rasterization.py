@@ -66,6 +66,8 @@ def test_gaussians_are_ordered_along_any_axis(device, cameras):
     assert weights()[0] > 5 * weights()[1]
     first, second = weights(-0.3, 0.0, 1.0)
     assert second > 5 * first
+    for length in (1e-5, 2.0**-80, 2.0**100):
+        assert weights(-0.3 * length, 0.0, length) == pytest.approx([first, second], rel=1e-5)
     assert weights(1e30, 0.0, 0.0)[0] > 0.5  # Both at least at a thousandth of their depth
 
 
