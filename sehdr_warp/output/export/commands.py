@@ -142,11 +142,11 @@ def run_convert(args: Convert) -> None:
     from ...splats import check_new_file, check_suffix
 
     command = shlex.join(["sehdr-warp", "export", str(args.source), "--out", str(args.out)])
-    if args.out.suffix.lower() == ".html":
-        raise UsageError(f"{args.out}: pages are written by {command}")
     if args.source.is_dir():
         raise UsageError(f"{args.source}: is a folder; runs are written by {command}")
-    check_suffix(args.source)
+    check_suffix(args.source)  # First, because export cannot read it either.
+    if args.out.suffix.lower() == ".html":
+        raise UsageError(f"{args.out}: pages are written by {command}")
     check_suffix(args.out)
     check_new_file(args.out, overwrite=args.overwrite)
     from .splat_edits import SplatEdits

@@ -32,6 +32,8 @@ def test_what_is_refused_is_refused_before_the_scene_is_read(tmp_path):
 def test_words_that_people_type_find_what_they_mean(tmp_path):
     with pytest.raises(UsageError, match="pages are written by sehdr-warp export 'my head.ply' --out x.html"):
         run_convert(Convert(source=Path("my head.ply"), out=Path("x.html")))
+    with pytest.raises(InputError, match="head.splat: .splat is not read"):  # Nor by export
+        run_convert(Convert(source=Path("head.splat"), out=Path("x.html")))
     with pytest.raises(UsageError, match="is a folder; runs are written by sehdr-warp export"):
         run_convert(Convert(source=tmp_path, out=tmp_path / "x.ply"))
     with pytest.raises(UsageError, match="meshes are written by sehdr-warp mesh 'my runs/a' --out files/x.usdc"):
