@@ -77,3 +77,21 @@ def test_alpha_keeps_pixels_out(tmp_path):
     np.testing.assert_array_equal(scene.views[1].image, pattern(64, 48, 1).astype(np.float32) / np.float32(255))
     assert scene.views[2].mask is None
     assert "transparency: 1 of 6 photos have transparent pixels, which are left out" in scene.notes
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+@pytest.mark.parametrize(("red", "clips"), [(3.0, True), (0.95, False)])
+def test_values_that_jpeg_makes_darker_amid_clipped_ones_are_clipped(tmp_path, suffix, red, clips):
+    """A lamp whose red clips: its noisy other colors, coarsely rounded, leave a third of the red at 250 to 254."""
+    write_colmap(tmp_path, size=(128, 96), name=f"{{:03d}}.{suffix}")
+    for seed, photo in enumerate(sorted((tmp_path / "images").iterdir())):
+        light = np.where(np.arange(128)[:, None] < 64, [red, 0.35, 0.1], 0.02) * np.ones((96, 1, 1))
+        light += 0.03 * np.sqrt(light) * np.random.default_rng(seed).normal(size=light.shape)
+        codes = np.rint(255 * light.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+        Image.fromarray(codes).save(photo, quality=92)
+        stored = np.asarray(Image.open(photo))
+    codes = load(tmp_path).views[-1].codes
+    white = (codes[8:-8, 8:56, 0] == 255).mean()
+    assert white > 0.97 if clips else white < 0.1
+    assert np.array_equal(codes[..., 1:], stored[..., 1:])
+    assert (suffix == "png" or not clips) == np.array_equal(codes, stored)

@@ -36,6 +36,8 @@ RAW_SUFFIXES = (
 )  # fmt: skip
 PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512
+_BLOCK, _AROUND, _LEAST_WHITE, _NEAR_WHITE = 8, 3, 0.1, 250
+"""Codes of a JPEG from _NEAR_WHITE are white if this part of its channel is in the _AROUND x _AROUND blocks around."""
 _opening = threading.Lock()  # Pillow's pixel limit, which is lifted while opening, is shared by all threads
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "AVIF")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
@@ -111,6 +113,26 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
         except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
     return EncodedImage(turn_upright(pixels, turn), None if alpha is None else turn_upright(alpha, turn))
+
+
+def with_whole_white(codes: np.ndarray) -> np.ndarray:
+    """Return the codes [H, W, 3] of a JPEG of 8 bits, in which those are white that its compression made darker.
+
+    It rounds colors, so up to half of the values of a lamp that clips in one channel have a code below 255. Each would
+    hold the lamp at white, against darker photos.
+    """
+    white = codes == 255
+    if not white.any():
+        return codes
+    height, width, _ = codes.shape
+    padded = np.pad(white, ((0, -height % _BLOCK), (0, -width % _BLOCK), (0, 0)))
+    rows, columns = padded.shape[0] // _BLOCK, padded.shape[1] // _BLOCK
+    counts = padded.reshape(rows, _BLOCK, columns, _BLOCK, 3).sum((1, 3), dtype=np.int32)
+    counts = np.pad(counts, ((_AROUND // 2,) * 2, (_AROUND // 2,) * 2, (0, 0)))
+    counts = sum(counts[i : i + rows, j : j + columns] for i in range(_AROUND) for j in range(_AROUND))
+    near = counts >= _LEAST_WHITE * (_AROUND * _BLOCK) ** 2
+    near = near.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:height, :width]
+    return np.where(near & (codes >= _NEAR_WHITE), np.uint8(255), codes)
 
 
 def grey_thumbnail(path: Path, side: int) -> np.ndarray:
