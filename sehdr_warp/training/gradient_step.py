@@ -6,6 +6,7 @@ average.
 """
 
 import math
+import random
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -33,6 +34,10 @@ from .training_views import TrainingView
 SKIPPED, MOST_INTERSECTIONS, OVERFLOWED = range(3)
 """Indices of GradientStep.step_counters: steps that were not finite, the largest number of intersections, and steps
 with more intersections than the capacity. Neither kind of step is applied."""
+
+TURNED_STEPS = 0.5
+"""Share of the steps that turn the axis of the order: with all of them, short trainings have 0.3 to 0.5 dB less on
+photos, and not more on views that are turned."""
 
 
 @dataclass(frozen=True)
@@ -105,11 +110,11 @@ class Dropout:
 
 
 class OrderAxis:
-    """Turns the axis along which a step orders Gaussians by depth, at random around the camera's.
+    """Turns the axis along which half of the steps order Gaussians by depth, at random around the camera's.
 
     Cameras in one place that look in other directions order Gaussians differently, because each does it by depth along
     its own axis. What is behind others in all photos is not constrained, and may be in front if the camera turns. So
-    the steps show it now and then.
+    steps show it now and then. The other half keeps the photos as exact as without.
 
     Attributes:
         axis: [3] of the next step, in the camera's coordinates; None if it is always the camera's own.
@@ -127,8 +132,9 @@ class OrderAxis:
         It keeps its memory, because CUDA graphs read it.
         """
         if self.axis is not None:
-            self._generator.manual_seed((self._random_seed * SEED_STRIDE + iteration) % 2**63)
-            self.axis[:2].uniform_(-self._slope, self._slope, generator=self._generator)
+            seed = (self._random_seed * SEED_STRIDE + iteration) % 2**63
+            slope = self._slope if random.Random(seed).random() < TURNED_STEPS else 0.0
+            self.axis[:2].uniform_(-slope, slope, generator=self._generator.manual_seed(seed))
 
 
 class GradientStep:

@@ -77,8 +77,9 @@ def test_an_axis_depends_on_seed_and_iteration_alone_and_keeps_its_memory(device
         return order.axis.tolist()
 
     assert axis(1, 600, 700) == axis(1, 700)
-    assert len({tuple(axis(seed, n)) for seed, n in ((1, 700), (2, 700), (1, 701), (2**62, 5))}) == 4
-    slopes = torch.tensor([axis(3, n)[:2] for n in range(200)])
+    slopes = torch.tensor([axis(seed, n)[:2] for seed in (3, 2**62) for n in range(200, 400, 2)])
+    turned = slopes.any(1)
+    assert 70 < int(turned.sum()) < 130 and len(slopes[turned].unique(dim=0)) == int(turned.sum())
     assert float(slopes.abs().max()) > 0.5 and float(slopes.mean(0).abs().max()) < 0.08
 
 
@@ -97,9 +98,9 @@ def test_a_turned_camera_shows_what_photos_from_its_place_show(angle):
     scene = Scene("wall", "transforms", views, means.double().numpy(), np.ones((2, 3), np.float32))
     times = {"densification.refine_start_iter": 1000, "densification.refine_stop_iter": 1001, "schedule.ema_window": 0}
     rates = {"optimizer.means": 1e-9, "optimizer.means_final": 1e-9, "optimizer.harmonics_dc": 0.03}
-    trainer = Trainer(scene, quick(length=200, **times, **rates, **{"model.order_angle": angle}), field)
-    for _ in range(200):
+    trainer = Trainer(scene, quick(length=400, **times, **rates, **{"model.order_angle": angle}), field)
+    for _ in range(400):
         trainer.step()
     wall, aside = (float(field.render(each).hdr[12, 12].mean()) for each in (camera, turned))
     assert wall == pytest.approx(1.5, rel=0.3)
-    assert aside < 4 * wall if angle else aside > 15 * wall
+    assert aside < 6 * wall if angle else aside > 15 * wall
