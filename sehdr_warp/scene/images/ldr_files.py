@@ -129,8 +129,8 @@ def with_whole_white(codes: np.ndarray) -> np.ndarray:
     rows, columns = padded.shape[0] // _BLOCK, padded.shape[1] // _BLOCK
     counts = padded.reshape(rows, _BLOCK, columns, _BLOCK, 3).sum((1, 3), dtype=np.int32)
     counts = np.pad(counts, ((_AROUND // 2,) * 2, (_AROUND // 2,) * 2, (0, 0)))
-    counts = sum(counts[i : i + rows, j : j + columns] for i in range(_AROUND) for j in range(_AROUND))
-    near = counts >= _LEAST_WHITE * (_AROUND * _BLOCK) ** 2
+    around = [counts[i : i + rows, j : j + columns] for i in range(_AROUND) for j in range(_AROUND)]
+    near = np.sum(around, axis=0) >= _LEAST_WHITE * (_AROUND * _BLOCK) ** 2
     near = near.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:height, :width]
     return np.where(near & (codes >= _NEAR_WHITE), np.uint8(255), codes)
 
