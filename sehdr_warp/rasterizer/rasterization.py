@@ -160,7 +160,7 @@ def rasterize(
         width, height, near_plane, eps2d, alpha_threshold, antialiased, depth, max_intersections, deterministic, *rays
     )
     tensors = GaussiansAndCamera(means, log_scales, quaternions, opacities, features, world_to_camera, intrinsics)
-    pool = checked_pool(tensors, options)  # Graphs of calls that were checked but for the background; None on the CPU
+    pool = checked_pool(tensors, options)  # Graphs of calls with these checked; None on the CPU
     if pool is None or background is not None or order_axis is not None:
         check_shapes(tensors, background, order_axis)
         check_opacities(opacities)

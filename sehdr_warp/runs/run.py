@@ -198,7 +198,7 @@ class Splats(RenderableScene):
         views, focals = [entry.camera for entry in cameras], field.photo_focals
         if focals is not None:  # Cameras of other focal lengths are not those of the photos.
             views = [view for view in views if focals.variance(view.fx) == EPS2D]
-        if focals is not None or field.antialiased:  # Of compensated opacities, for the order on maps alone
+        if focals is not None or field.antialiased:  # Of compensated opacities for maps and ray limits
             field.photo_cameras = views
 
 

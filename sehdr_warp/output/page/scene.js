@@ -50,7 +50,7 @@ const opening = () => facts.opening || facts.views[facts.first].camera;
 
 // The engine's Gaussians end early, are lifted to make up for it, are left out where small, shrunk where larger than the
 // picture, and drawn at any nearness; ours end at the same opacity alone and behind the near plane. Both linearize the
-// projection, ours no farther outside of the picture than a margin, and of the photos. The engine's low-pass filter has a fourth of our
+// projection, ours no farther outside of the picture, and of the photos, than a margin. The engine's low-pass filter has a fourth of our
 // variance, because its lengths are half pixels. Here it is the photos' filter (see pixel_filter.py) and at least a
 // pixel's, and opacities keep the light that the photos' filter gives.
 function asOurs(material, chunks) {
