@@ -123,7 +123,8 @@ def write_brackets(
         response=response,
         group_by=group_by,
     )
-    radiances: list[tuple[str, np.ndarray]] = list(views.items() if isinstance(views, Mapping) else views)
+    pairs: Any = views.items() if isinstance(views, Mapping) else views
+    radiances: list[tuple[str, np.ndarray]] = list(pairs)
     with writer.open(overwrite):
         for file_name, (name, radiance) in zip(safe_names([name for name, _ in radiances]), radiances, strict=True):
             writer.write(file_name, radiance, (cameras or {}).get(name))
