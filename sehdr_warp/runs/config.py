@@ -71,7 +71,7 @@ class ModelConfig(_Table):
     """lower the opacity of Gaussians that the low-pass filter widens (Mip-Splatting)"""
     order_angle: Annotated[float, Field(ge=0.0, le=60.0)] = 25.0
     """most degrees, sideways and up or down, by which half of the steps turn at random the axis that Gaussians are
-    ordered along, so that views turned away from the photos look right; 0 as in 3DGS; wide photos have no axis"""
+    ordered along, so that views turned away from the photos look right; 0: 3DGS; fisheyes and panoramas have none"""
     dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     """share of the Gaussians that the last step leaves out at random, against overfitting to few photos (DropGaussian);
     it grows from 0"""

@@ -124,17 +124,17 @@ class OrderAxis:
         """Prepare to turn the axis by up to an angle in degrees, to the sides and up and down."""
         self.axis = torch.tensor([0.0, 0.0, 1.0], device=device) if angle else None
         self._slope, self._random_seed = math.tan(math.radians(angle)), random_seed
-        self._generator = torch.Generator(device)
 
     def draw(self, iteration: int) -> None:
-        """Draw the axis of the step that ends at an iteration; the same in a resumed training.
+        """Draw the axis of the step that ends at an iteration; the same in a resumed training, and on every device.
 
         It keeps its memory, because CUDA graphs read it.
         """
         if self.axis is not None:
-            seed = (self._random_seed * SEED_STRIDE + iteration) % 2**63
-            slope = self._slope if random.Random(seed).random() < TURNED_STEPS else 0.0
-            self.axis[:2].uniform_(-slope, slope, generator=self._generator.manual_seed(seed))
+            generator = random.Random(self._random_seed * SEED_STRIDE + iteration)
+            slope = self._slope if generator.random() < TURNED_STEPS else 0.0
+            for component in self.axis[:2]:
+                component.fill_(generator.uniform(-slope, slope))  # Unlike a copy, it does not wait for a GPU.
 
 
 class GradientStep:
