@@ -79,9 +79,9 @@ def test_alpha_keeps_pixels_out(tmp_path):
     assert "transparency: 1 of 6 photos have transparent pixels, which are left out" in scene.notes
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png"])
+@pytest.mark.parametrize("suffix", ["jpg", "avif", "png"])
 @pytest.mark.parametrize(("red", "clips"), [(3.0, True), (0.95, False)])
-def test_values_that_jpeg_makes_darker_amid_clipped_ones_are_clipped(tmp_path, suffix, red, clips):
+def test_values_that_rounded_colors_make_darker_amid_clipped_ones_are_clipped(tmp_path, suffix, red, clips):
     """A lamp whose red clips: its noisy other colors, coarsely rounded, leave a third of the red at 250 to 254."""
     write_colmap(tmp_path, size=(128, 96), name=f"{{:03d}}.{suffix}")
     for seed, photo in enumerate(sorted((tmp_path / "images").iterdir())):

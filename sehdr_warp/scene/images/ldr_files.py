@@ -29,6 +29,7 @@ LDR_SUFFIXES = (
     ".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".webp", ".bmp", ".avif", *HEIF_SUFFIXES * heif_installed(),
 )  # fmt: skip
 """HEIF's among them if the package that decodes it is installed."""
+ROUNDS_COLORS = (*JPEG_SUFFIXES, *HEIF_SUFFIXES, ".avif")  # Formats that store colors coarser than brightness
 HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (
     ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".rw2", ".rwl", ".orf", ".pef", ".srw",
@@ -37,7 +38,8 @@ RAW_SUFFIXES = (
 PHOTO_SUFFIXES = (*LDR_SUFFIXES, *RAW_SUFFIXES, *HDR_SUFFIXES)
 _BAND_ROWS = 512
 _BLOCK, _AROUND, _LEAST_WHITE, _NEAR_WHITE = 8, 3, 0.1, 250
-"""Codes of a JPEG from _NEAR_WHITE are white if this part of its channel is in the _AROUND x _AROUND blocks around."""
+"""Codes of a photo that rounds colors are white from _NEAR_WHITE, if this part of their channel is in the _AROUND x
+_AROUND blocks around them."""
 _opening = threading.Lock()  # Pillow's pixel limit, which is lifted while opening, is shared by all threads
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "AVIF")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
@@ -116,7 +118,7 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
 
 
 def with_whole_white(codes: np.ndarray) -> np.ndarray:
-    """Return the codes [H, W, 3] of a JPEG of 8 bits, in which those are white that its compression made darker.
+    """Return the codes [H, W, 3] of 8 bits of a photo, in which those are white that its compression made darker.
 
     It rounds colors, so up to half of the values of a lamp that clips in one channel have a code below 255. Each would
     hold the lamp at white, against darker photos.
