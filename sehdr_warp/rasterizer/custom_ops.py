@@ -108,7 +108,8 @@ def _run_rasterize(tensors: Sequence[Tensor], *options: Any) -> list[Tensor]:
 
 
 def _fake_rasterize(tensors: Sequence[Tensor], *values: Any) -> list[Tensor]:
-    check_shapes(GaussiansAndCamera(*tensors[:7]), *map(_optional, tensors[7:]))
+    background, order_axis = map(_optional, tensors[7:])
+    check_shapes(GaussiansAndCamera(*tensors[:7]), background, order_axis)
     options = RenderOptions(*values)
     height, width = options.height, options.width
     means, features, pose = tensors[0], tensors[4], tensors[5]

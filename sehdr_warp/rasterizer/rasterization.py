@@ -265,8 +265,8 @@ def _render_cameras(tensors: GaussiansAndCamera, options: RenderOptions, order_a
     )
     calls = [GaussiansAndCamera(means, log_scales, quaternions, *each) for each in of_cameras]
     pools = [None if order_axis is not None else pool_for(call, options) for call in calls]
-    begun = [_begin_view(call, options, pool, order_axis) for call, pool in zip(calls, pools, strict=True)]
-    centers, finishes = zip(*begun, strict=True)
+    views = [_begin_view(call, options, pool, order_axis) for call, pool in zip(calls, pools, strict=True)]
+    centers, finishes = zip(*views, strict=True)
     # One tensor that every image is rendered from, so that its gradient holds every camera's.
     means2d = torch.stack(centers)
     return join_renderings(means2d, [finish(part) for finish, part in zip(finishes, means2d, strict=True)])

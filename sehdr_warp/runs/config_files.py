@@ -28,7 +28,7 @@ _GONE = tomllib.loads((resources.files("sehdr_warp.runs") / "gone.toml").read_te
 RENAMED: dict[str, str] = _GONE.pop("renamed")  # Fields of version 0.2, each with its name since version 0.3
 GONE: dict[str, str] = {path: advice for advice, paths in _GONE.items() for path in paths}
 """Fields of earlier versions that no longer exist, each with what to do instead."""
-ADDED: dict[str, Any] = {"model.order_angle": 0.0}
+NEW_FIELDS: dict[str, Any] = {"model.order_angle": 0.0}
 """Fields that runs of earlier versions lack, each with the value that these were trained by."""
 _RENAMED_VALUES = {"densification.strategy": {"relocation": "mcmc", "gradient": "adc"}}
 
@@ -176,7 +176,7 @@ def config_of_run(values: dict, file: Path) -> Config:
     A field that is gone is left out with a warning, not refused: the run was trained with it, and its checkpoint states
     the hash of its file, so nobody can leave it out there.
     """
-    for path, value in ADDED.items():
+    for path, value in NEW_FIELDS.items():
         part, _, name = path.rpartition(".")
         if isinstance(table := values.get(part), dict):
             values = values | {part: {name: value} | table}

@@ -45,22 +45,22 @@ def test_matches_the_reference(device, dtype, channels, option):
 
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_gaussians_are_ordered_along_any_axis(device, cameras):
-    """Of two at the sides of the image, the one that is in front changes with the axis; depths stay the camera's."""
-    scene = random_scene(count=2, channels=2, width=40, height=30).to(torch.float32, device)
-    means, pose = torch.tensor([[-0.05, 0.0, 4.0], [0.05, 0.0, 4.01]], device=device), torch.eye(4, device=device)
-    shape = [torch.full((2, 3), -1.0, device=device), *(tensor.detach() for tensor in scene.tensors[2:3])]
-    others = [*shape, torch.full((2,), 0.9, device=device), torch.eye(2, device=device)]
-    views = pose.expand(cameras, 4, 4), torch.tensor([40.0, 40.0, 20.0, 15.0], device=device).expand(cameras, 4)
-    views = views if cameras > 1 else [tensor[0] for tensor in views]
+    """The left Gaussian is in front along the camera's axis, the right one along an axis to the left."""
+    means = torch.tensor([[-0.05, 0.0, 4.0], [0.05, 0.0, 4.01]], device=device)
+    log_scales, quaternions = torch.full((2, 3), -1.0, device=device), torch.eye(4, device=device)[[0, 0]]
+    opacities, features = torch.full((2,), 0.9, device=device), torch.eye(2, device=device)
+    pose, pinhole = torch.eye(4, device=device), torch.tensor([40.0, 40.0, 20.0, 15.0], device=device)
+    if cameras > 1:
+        pose, pinhole = pose.expand(cameras, 4, 4), pinhole.expand(cameras, 4)
 
     def weights(*axis):
-        axis = torch.tensor(axis, device=device) if axis else None
-        rendering = rasterize(means, *others, *views, 40, 30, order_axis=axis, depth=True)
-        assert torch.allclose(rendering.depths, means[:, 2])
-        assert (
-            3.9 < float(rendering.depth.reshape(cameras, 30, 40)[0, 15, 20] / rendering.alpha[..., 15, 20].max()) < 4.1
+        options = {"order_axis": torch.tensor(axis, device=device)} if axis else {}
+        rendering = rasterize(
+            means, log_scales, quaternions, opacities, features, pose, pinhole, 40, 30, depth=True, **options
         )
-        return rendering.image.reshape(cameras, 30, 40, 2)[-1, 15, 20].tolist()
+        mean_depth = rendering.depth[..., 15, 20] / rendering.alpha[..., 15, 20]
+        assert torch.allclose(rendering.depths, means[:, 2]) and 3.999 < float(mean_depth.min()) < 4.011
+        return rendering.image[..., 15, 20, :].reshape(cameras, 2)[-1].tolist()
 
     assert weights() == weights(0.0, 0.0, 1.0) == weights(0.0, 0.9, 1.0)
     assert weights()[0] > 5 * weights()[1]

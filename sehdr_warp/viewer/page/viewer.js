@@ -39,7 +39,7 @@ async function start() {
   useRun(0);
   new ResizeObserver(resize).observe(stage);
   home();
-  if (facts.history.length > 1) note(described());
+  if (facts.history.length > 1) note(description());
 }
 // The path of a run without the folders that all runs share.
 function label(run) {
@@ -67,7 +67,7 @@ async function renew() {
     const edits = JSON.stringify(facts.history);
     runs = answer.runs;
     useRun(state.run);
-    if (JSON.stringify(facts.history) !== edits) note(described());  // By another page
+    if (JSON.stringify(facts.history) !== edits) note(description());  // By another page
     request(false);
   } catch (error) { tell(error.message); }
 }
@@ -480,9 +480,9 @@ $("undo").addEventListener("click", () => queued(async () => {
 }));
 const asOptions = edits => Object.fromEntries(Object.entries(edits).map(([name, value]) => [name, value.points ? region(value) : value]));
 async function edit(history) {
-  if (!await change("edit", {...asOptions(history.at(-1)), history}, described)) offer();  // As where nothing would be left
+  if (!await change("edit", {...asOptions(history.at(-1)), history}, description)) offer();  // As where nothing would be left
 }
-function described() {
+function description() {
   const words = value => value === true ? "" : " " + (Array.isArray(value) ? value.map(i => runs[i].argument).join(" ") : value);
   const flags = Object.entries(asOptions(facts.history.at(-1))).map(([name, value]) => ` --${name.replace("_", "-")}` + words(value)).join("");
   return flags ? `${counts(facts.gaussians)} Gaussians; sehdr-warp export ${facts.argument} --out part.ply${flags}` : "all of it is shown";
