@@ -109,11 +109,11 @@ def history_of(request: dict) -> list[dict]:
     for name, value in (item for edits in history for item in edits.items()):
         if isinstance(value, dict):
             points = np.array(value.get("points"), np.float64)
-            drawn = value.get("shape") in ("sphere", "box") and points.shape == (2, 3) and np.isfinite(points).all()
+            is_edit = value.get("shape") in ("sphere", "box") and points.shape == (2, 3) and np.isfinite(points).all()
         else:
             numbers = value if isinstance(value, list) else [value]
-            drawn = all(isinstance(number, int | float) for number in numbers)
-        if not drawn:
+            is_edit = all(isinstance(number, int | float) for number in numbers)
+        if not is_edit:
             raise SehdrError(f"history: {name:.40} is not an edit")
     return history
 

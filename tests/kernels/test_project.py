@@ -34,8 +34,9 @@ def test_values_and_gradients_are_the_references(device, dtype, bound, limits, a
     leaves = [tensor.requires_grad_() for tensor in inputs()]
     ours = [tensor.detach().to(device, dtype).requires_grad_() for tensor in leaves]
     x, y = limits
-    truth = project_reference(*leaves, *OPTIONS[:5], antialiased, x, y)
     options = OPTIONS._replace(antialiased=antialiased, ray_limit_x=x, ray_limit_y=y)
+    width, height, near_plane, eps2d, threshold = options[:5]
+    truth = project_reference(*leaves, width, height, near_plane, eps2d, threshold, antialiased, x, y)
     results = project_to_camera(*ours, options)
     visible = truth[4][:, 0] > 0
     assert 30 < visible.sum() < 120 and torch.equal(results.extents.cpu()[:, 0] > 0, visible)

@@ -244,6 +244,6 @@ def test_a_light_of_faint_gaussians_is_as_bright_as_its_pixels():
     scene.gaussians.opacity_logits.data[lamp] = -4
     cameras = views()
     (light,) = find_lights(scene, lamp.float(), cameras)
-    shown = max(float(scene.render(camera).hdr.max()) for camera, _ in cameras)
-    assert shown < 100 and light.radiance.mean() == pytest.approx(shown, rel=0.2)
+    brightest = max(float(scene.render(camera).hdr.max()) for camera, _ in cameras)
+    assert brightest < 100 and light.radiance.mean() == pytest.approx(brightest, rel=0.2)
     assert light.radiance * light.shape.solid_angle(np.zeros(3)) == pytest.approx(received(scene), rel=0.1)

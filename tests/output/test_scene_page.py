@@ -185,6 +185,18 @@ def test_gaussians_beyond_the_picture_are_drawn_as_ours_are(tmp_path):
         assert exposure.max() > 0.1 and -10 * np.log10(np.mean(error**2)) > 38
 
 
+def check_page_against_render(scene, file, width, height):
+    """Check that the page of a scene shows what its render shows; return the page's camera and that render."""
+    write_scene_page(scene, file)
+    with browser() as chromium, page_of(chromium, file.as_uri(), width, height) as page:
+        page.wait_for_selector(FULL)
+        camera_of_page = Camera.from_dict(page.evaluate("document.getElementById('stage').pose"))
+        picture = pixels(page, "#picture")
+    rendered = scene.render_ldr(camera_of_page).numpy()
+    assert -10 * np.log10(np.mean((picture - rendered) ** 2)) > 50
+    return camera_of_page, rendered
+
+
 @pytest.mark.parametrize("photos", [FocalRange(40.0, 40.0), None])
 def test_a_page_that_is_wider_than_the_photos_has_their_projection(tmp_path, photos):
     beside = replace(splats([(0.9, 0, -2.6), (0, 0, 0)], [0.9, 0.9], scale=0.12), color_model="linear")
@@ -192,14 +204,8 @@ def test_a_page_that_is_wider_than_the_photos_has_their_projection(tmp_path, pho
     field = field_of(beside)
     field.photo_focals = photos
     scene = Splats(tmp_path / "beside", field, (Entry("0", "train", camera()),))
-    file = write_scene_page(scene, tmp_path / "beside.html")
-    with browser() as chromium, page_of(chromium, file.as_uri(), 700, 140) as page:
-        page.wait_for_selector(FULL)
-        page_camera = Camera.from_dict(page.evaluate("document.getElementById('stage').pose"))
-        picture = pixels(page, "#picture")
-        rendered = scene.render_ldr(page_camera).numpy()
-        assert page_camera.width / page_camera.fx > 2 and rendered.max() > 0.5
-        assert -10 * np.log10(np.mean((picture - rendered) ** 2)) > 50
+    camera_of_page, rendered = check_page_against_render(scene, tmp_path / "beside.html", 700, 140)
+    assert camera_of_page.width / camera_of_page.fx > 2 and rendered.max() > 0.5
 
 
 @pytest.mark.parametrize(("focal", "antialiased"), [(75.0, False), (600.0, False), (None, False), (None, True)])
@@ -211,11 +217,5 @@ def test_lamps_smaller_than_a_pixel_keep_their_light(tmp_path, focal, antialiase
     field = field_of(lamps)
     field.photo_focals = focal and FocalRange(focal, focal)
     scene = Splats(tmp_path / "lamps", field, (Entry("0", "train", camera()),))
-    file = write_scene_page(scene, tmp_path / "lamps.html")
-    with browser() as chromium, page_of(chromium, file.as_uri(), 240, 200) as page:
-        page.wait_for_selector(FULL)
-        page_camera = Camera.from_dict(page.evaluate("document.getElementById('stage').pose"))
-        picture = pixels(page, "#picture")
-        rendered = scene.render_ldr(page_camera).numpy()
-        assert page_camera.fx == pytest.approx(300)
-        assert -10 * np.log10(np.mean((picture - rendered) ** 2)) > 50
+    camera_of_page, _ = check_page_against_render(scene, tmp_path / "lamps.html", 240, 200)
+    assert camera_of_page.fx == pytest.approx(300)

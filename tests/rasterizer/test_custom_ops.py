@@ -28,7 +28,8 @@ def step(*leaves):
     for _ in range(3):
         colors = spherical_harmonics(1, coefficients, leaves[0], torch.zeros(3)) + leaves[4]
         options = {"background": torch.ones(3), "order_axis": torch.tensor([0.3, 0.1, 1.0])}
-        rendering = rasterize(*leaves[:4], colors, *leaves[5:], WIDTH, HEIGHT, depth=True, **options)
+        splats_and_camera = [*leaves[:4], colors] + list(leaves[5:])
+        rendering = rasterize(*splats_and_camera, WIDTH, HEIGHT, depth=True, **options)
         image = rendering.image * 2.0
         total = total + ssim(image, torch.full_like(image, 0.5)) + rendering.alpha.mean() + rendering.depth.mean()
         total = total + (rendering.means2d[:, 0] * rendering.visible).mean() + ssim_map(image, image.detach()).mean()

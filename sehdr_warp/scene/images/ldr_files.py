@@ -29,7 +29,7 @@ LDR_SUFFIXES = (
     ".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".webp", ".bmp", ".avif", *HEIF_SUFFIXES * heif_installed(),
 )  # fmt: skip
 """HEIF's among them if the package that decodes it is installed."""
-ROUNDS_COLORS = (*JPEG_SUFFIXES, *HEIF_SUFFIXES, ".avif")  # Formats that store colors coarser than brightness
+ROUNDS_COLORS = JPEG_SUFFIXES + HEIF_SUFFIXES + (".avif",)  # Formats that store colors coarser than brightness
 HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (
     ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".rw2", ".rwl", ".orf", ".pef", ".srw",
