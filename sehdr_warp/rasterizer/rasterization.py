@@ -144,7 +144,8 @@ def rasterize(
         ray_limit_y: likewise y/z.
         order_axis: [3] of any length, in the camera's coordinates, along which Gaussians are ordered by depth; by
             default (0, 0, 1), the camera's own axis. A Gaussian that is not in front along it is first. On a GPU such
-            calls are launched, and not replayed as CUDA graphs.
+            calls are launched, and not replayed as CUDA graphs; an axis of 0 or that is not finite orders there as the
+            camera's own.
 
     Raises:
         TypeError: if an argument is not a tensor or not an integer.

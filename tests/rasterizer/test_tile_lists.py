@@ -11,6 +11,7 @@ from sehdr_warp.rasterizer.tile_lists import (
     TileGrid,
     build_tile_lists,
     depth_order,
+    depths_along,
     emit_intersections,
     find_tile_ranges,
     order_gaussians,
@@ -18,7 +19,7 @@ from sehdr_warp.rasterizer.tile_lists import (
 from sehdr_warp.rasterizer.warp_launch.launching import sort_pairs
 
 from .emulated_graphs import tensors_of
-from .scenes import packed, random_scene
+from .scenes import packed, projected, random_scene
 
 GRID, UNWRITTEN = TileGrid(columns=20, rows=15), -7
 
@@ -113,6 +114,18 @@ def test_depths_beyond_the_bits_of_the_keys_keep_their_order_up_to_ties(device):
     for keep_emit_order, expected in ((False, [2, 3, 6, 4, 5, 0, 1]), (True, [3, 2, 6, 4, 5, 0, 1])):
         emit_order = order_gaussians(splats, keep_emit_order=keep_emit_order)
         assert build_tile_lists(splats, emit_order, 16, 16).gaussians.tolist() == expected
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 0), (NAN, NAN, NAN), (NAN, 0, 1), (1, 0, NAN), (INF, 0, 1)])
+def test_an_axis_of_no_direction_orders_as_the_cameras_own(device, axis):
+    """On a GPU nothing else looks at its numbers."""
+    scene = random_scene(count=500).to(torch.float32, device)
+    gaussians = projected(scene)
+    along = depths_along(torch.tensor(axis, dtype=torch.float32, device=device), gaussians, scene.arguments[6])
+    assert torch.equal(along, gaussians.depths * along.new_tensor(0.001)) and along.max() > 0
 
 
 def test_subtiles_are_those_that_an_ellipse_touches(device):
