@@ -22,7 +22,7 @@ from .float_photos import float_codes
 from .images.downsampling import area_average
 from .images.gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
 from .images.hdr_files import hdr_size, read_hdr, read_light
-from .images.ldr_files import ROUNDS_COLORS, EncodedImage, file_kind, with_whole_white
+from .images.ldr_files import EncodedImage, file_kind, with_whole_white
 from .lens import Lens, Undistortion
 from .masks import mask_note, read_mask
 from .photo_content import require_content, unused_bits_note
@@ -209,7 +209,7 @@ class _Preprocessor:
         photo, encoding = _read_stored(record, self.gain_map_problems, oriented=oriented, masked=self.alpha == "mask")
         if photo.levels > 255 and file_kind(record.image) == "encoded" and record.gain_map_scale is None:
             self.largest_code = max(self.largest_code, int(photo.pixels.max()))
-        if record.image.suffix.lower() in ROUNDS_COLORS and photo.levels == 255 and photo.above_white is None:
+        if photo.rounds_colors and photo.levels == 255 and photo.above_white is None:
             photo = replace(photo, pixels=with_whole_white(photo.pixels))
         masks = resample.borders()
         if stored is not None:

@@ -29,7 +29,6 @@ LDR_SUFFIXES = (
     ".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".webp", ".bmp", ".avif", *HEIF_SUFFIXES * heif_installed(),
 )  # fmt: skip
 """HEIF's among them if the package that decodes it is installed."""
-ROUNDS_COLORS = JPEG_SUFFIXES + HEIF_SUFFIXES + (".avif",)  # Formats that store colors coarser than brightness
 HDR_SUFFIXES = (".exr", ".hdr")
 RAW_SUFFIXES = (
     ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".rw2", ".rwl", ".orf", ".pef", ".srw",
@@ -41,6 +40,7 @@ _BLOCK, _AROUND, _LEAST_WHITE, _NEAR_WHITE = 8, 3, 0.1, 250
 """Codes of a photo that rounds colors are white from _NEAR_WHITE, if this part of their channel is in the _AROUND x
 _AROUND blocks around them."""
 _opening = threading.Lock()  # Pillow's pixel limit, which is lifted while opening, is shared by all threads
+_ROUNDS_COLORS = "JPEG", "MPO", "HEIF", "AVIF"  # Formats that store colors coarser than brightness; lossy WebP too
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "AVIF")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _OTHER_MODES = {
@@ -76,6 +76,7 @@ class EncodedImage:
     alpha: np.ndarray | None  # [H, W] float32 in [0, 1]; None if all is opaque
     above_white: np.ndarray | None = None  # [H, W, 3] float16, light over white's; 0 if unknown. None if not stated
     above_white_deviation: float = 0.0  # Standard deviation of the natural logarithm of above_white
+    rounds_colors: bool = False  # Whether its format stores colors coarser than brightness, see with_whole_white()
 
     @property
     def levels(self) -> int:
@@ -106,15 +107,28 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
     """
     with open_image(path, mask=mask) as image:
         try:
-            with (
-                silent_stderr() if image.format == "TIFF" else nullcontext()
-            ):  # libtiff prints of what it cannot decode.
+            # libtiff prints of what it cannot decode.
+            with silent_stderr() if image.format == "TIFF" else nullcontext():
                 file_orientation = orientation_of(image) if image.format == "TIFF" else 1
                 pixels, alpha = _decode(image, path)
             turn = turn_of_loaded(image, file_orientation, oriented=oriented)
+            rounds = _is_lossy_webp(path) if image.format == "WEBP" else image.format in _ROUNDS_COLORS
         except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
-    return EncodedImage(turn_upright(pixels, turn), None if alpha is None else turn_upright(alpha, turn))
+    alpha = None if alpha is None else turn_upright(alpha, turn)
+    return EncodedImage(turn_upright(pixels, turn), alpha, rounds_colors=rounds)
+
+
+def _is_lossy_webp(path: Path) -> bool:
+    """Return whether a WebP's pixels are in the lossy chunk; chunks of its profile and alpha stand before it."""
+    with path.open("rb") as file:
+        file.seek(12)
+        while len(head := file.read(8)) == 8:
+            kind, length = struct.unpack("<4sI", head)
+            if kind in (b"VP8 ", b"VP8L"):
+                return kind == b"VP8 "
+            file.seek(length + length % 2, 1)
+    return False
 
 
 def with_whole_white(codes: np.ndarray) -> np.ndarray:
