@@ -20,6 +20,7 @@ from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
 from ..scene.camera import require_camera
+from .cameras.selection import reframe
 from .images.colorspace import color_space, matrix_to
 from .images.display import display_gain, encode_srgb
 from .render_views import shared_tone_map
@@ -70,6 +71,7 @@ FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska", ".av
 """FFmpeg's formats by suffix: those of one file. Others write further files beside it, whoever owns their names."""
 _SLOWEST, _FASTEST = 0.1, 1000.0  # Frames a second
 _NTSC = 1e-4  # Relative difference up to which a rate is a whole one over 1.001, as of television
+_SAME_SHAPE = 0.01  # Relative difference of width over height up to which it is that of rounded sizes
 _SQUARE = 0.005  # Difference of width and height up to which a calibrated camera's pixels are meant to be square
 
 
@@ -87,6 +89,8 @@ def write_film(
 ) -> Path:
     """Render a film of cameras, one each frame, at the size of the first, and return its path.
 
+    Cameras of another shape keep their vertical field of view, and show more or less at the sides.
+
     Args:
         run: From load_run, train or load_splats.
         out: The file; its suffix decides the container.
@@ -103,7 +107,8 @@ def write_film(
             then.
 
     Raises:
-        SehdrError: Without PyAV (the extra `film`) or its encoder, without cameras, or for another transfer or ramp.
+        SehdrError: Without PyAV (the extra `film`) or its encoder, without cameras, for another transfer or ramp, or
+            for a panorama among cameras of another shape.
         TypeError: For what is not a Camera.
         InputError: If `out` exists (unless overwrite), or is not a film in one file by its suffix.
     """
@@ -112,8 +117,8 @@ def write_film(
     av, kind = film_library(), TRANSFERS[transfer]
     out, first, container_format = Path(out), cameras[0], film_format(out)
     check_rate(fps)
-    # Chroma of 4:2:0 covers two by two pixels.
-    width, height = (max(2, side - side % 2) for side in (first.width, first.height))
+    framed = _at_one_size(cameras, out)
+    width, height = framed[0].width, framed[0].height
     aspect = first.fy / first.fx if first.is_pinhole else 1.0  # Width of a pixel over its height
     gain = run.base_time * display_gain(run.response)
     stops = np.linspace(*ev_ramp, len(cameras))
@@ -128,8 +133,8 @@ def write_film(
                 stream = _add_stream(container, kind, fps, width, height, len(cameras))
                 if abs(aspect - 1) > _SQUARE:
                     stream.codec_context.sample_aspect_ratio = Fraction(aspect).limit_denominator(100)
-                for camera, ev in zip(_with_progress(cameras, out, tell), stops):
-                    hdr = run.render(camera.resized(width, height)).hdr.cpu().numpy() * np.float32(2.0**ev)
+                for camera, ev in zip(_with_progress(framed, out, tell), stops):
+                    hdr = run.render(camera).hdr.cpu().numpy() * np.float32(2.0**ev)
                     encoded = tone_map(hdr) if tone_map else encode(hdr * np.float32(gain), transfer)
                     for packet in stream.encode(_frame(av, encoded, kind)):
                         container.mux(packet)
@@ -139,6 +144,21 @@ def write_film(
             remedy = f"choose {'.mov' if transfer in LOG_CURVES else '.mp4'} or another size"
             raise SehdrError(f"{out}: cannot be written as a film ({error}); {remedy}") from error
     return out
+
+
+def _at_one_size(cameras: Sequence[Camera], out: Path) -> list[Camera]:
+    """Return cameras at the size of the first, up to a pixel of each side."""
+    first = cameras[0]
+    # Chroma of 4:2:0 covers two by two pixels.
+    size = max(2, first.width - first.width % 2), max(2, first.height - first.height % 2)
+    shapes = np.array([camera.width / camera.height for camera in cameras])
+    alike = abs(shapes / shapes[0] - 1) < _SAME_SHAPE
+    if others := (~alike).sum():
+        problem = (
+            f"{others} of {len(cameras)} cameras are not of the shape of the first, {first.width} x {first.height}"
+        )
+        log.warning("%s: %s: their frames show more or less at the sides", out, problem)
+    return [camera.resized(*size) if same else reframe(camera, *size) for camera, same in zip(cameras, alike)]
 
 
 def _check_options(cameras: Sequence[Camera], transfer: str, ev_ramp: tuple[float, float]) -> None:
