@@ -186,8 +186,9 @@ def check_options(
     if size is not None:
         read_size(size)
     read_aovs(aovs)
-    if evs is None and exposures is None and (multipart or ldr_brackets or group_by != "view"):
-        raise SehdrError("brackets need exposures; set evs (--evs=-2,0,2) or exposures")
+    for_brackets = {"multipart": multipart, "ldr_brackets": ldr_brackets, "group_by": group_by != "view"}
+    if evs is None and exposures is None and (names := [name for name, is_set in for_brackets.items() if is_set]):
+        raise SehdrError(f"{', '.join(names)}: brackets need exposures; set evs (--evs=-2,0,2) or exposures")
     check_pixel_type(pixel)
     if (ocio is None) != (view is None):
         need = "previews through OpenColorIO need --ocio, a config, and --view, one of its views"

@@ -22,7 +22,7 @@ from .sog import read_sog, write_sog
 from .spz import read_spz, write_spz
 from .streamed_sog import NAME as STREAMED_SOG
 from .streamed_sog import read_streamed_sog, write_streamed_sog
-from .usd import read_usd, write_usd
+from .usd import pxr, read_usd, write_usd
 
 log = logging.getLogger(__name__)
 USD_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
@@ -96,7 +96,12 @@ def cameras_beside(path: Path) -> Path | None:
 
 
 def check_new_file(path: Path, *, cameras: bool = False, overwrite: bool = False) -> None:
-    """Raise InputError if a file of Gaussians, or cameras beside it, would replace what may not be replaced."""
+    """Raise InputError if a file of Gaussians, or cameras beside it, would replace what may not be replaced.
+
+    Raises SehdrError for OpenUSD without its library.
+    """
+    if path.suffix.lower() in USD_SUFFIXES:
+        pxr("Usd")
     if path.name == STREAMED_SOG:
         check_absent(path.parent, overwrite, folder=True)
         if cameras:

@@ -1,5 +1,6 @@
 """Export and convert as typed: refusals before a scene is read."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ def test_a_wrong_suffix_gets_a_line_with_all_that_export_writes(tmp_path):
         run_export(Export(run=tmp_path, out=tmp_path / "scene.splat"))
 
 
-def test_what_is_refused_is_refused_before_the_scene_is_read(tmp_path):
+def test_what_is_refused_is_refused_before_the_scene_is_read(tmp_path, monkeypatch):
     (tmp_path / "damaged.ply").write_text("ply")
     for name in ("a.ply", "a.html", "a.glb.cameras.json"):
         (tmp_path / name).write_text("mine")
@@ -25,8 +26,11 @@ def test_what_is_refused_is_refused_before_the_scene_is_read(tmp_path):
             run_export(Export(run=tmp_path / "damaged.ply", out=tmp_path / name, cameras=name == "a.glb"))
     with pytest.raises(InputError, match="exists already"):
         run_convert(Convert(source=tmp_path / "damaged.ply", out=tmp_path / "a.ply"))
-    with pytest.raises(SehdrError, match="brackets need exposures"):
+    with pytest.raises(SehdrError, match="^multipart: brackets need exposures"):
         run_render(Render(run=tmp_path / "damaged.ply", out=tmp_path, pictures=ViewFileOptions(multipart=True)))
+    monkeypatch.setitem(sys.modules, "pxr.Usd", None)
+    with pytest.raises(SehdrError, match="OpenUSD is not installed; run `pip install"):
+        run_export(Export(run=tmp_path / "damaged.ply", out=tmp_path / "new.usda"))
 
 
 def test_words_that_people_type_find_what_they_mean(tmp_path):
