@@ -104,10 +104,16 @@ class RadianceField(nn.Module):
         """Rays up to which views are linearized."""
         return RayLimits.of(self.photo_cameras)
 
+    @cached_property
+    def along_rays(self) -> bool:
+        """True if pinholes, too, are drawn along the rays of their pixels, see need_rays(); Trainer sets it."""
+        return pixel_filter.need_rays(self.photo_cameras)
+
     def camera_tensors(self, camera: Camera) -> CameraTensors:
         """Return a camera of scene coordinates in those of the Gaussians, on their device."""
         require_camera(camera)
-        return CameraTensors.of(self.normalization.camera(camera), self.gaussians.means.device)
+        camera, device = self.normalization.camera(camera), self.gaussians.means.device
+        return CameraTensors.of(camera, device, along_rays=self.along_rays)
 
     def render_photo(
         self,
@@ -195,7 +201,7 @@ class RadianceField(nn.Module):
         """
         tensors = self.camera_tensors(camera)
         pose = tensors.world_to_camera
-        if tensors.directions is None:
+        if camera.is_pinhole:
             depth = self.gaussians.means @ pose[2, :3, None] + pose[2, 3]
         else:
             depth = (self.gaussians.means - tensors.position).norm(dim=1, keepdim=True)
@@ -347,10 +353,7 @@ class RadianceField(nn.Module):
         at_place: bool = False,
         order_axis: Tensor | None = None,
     ) -> Rendering:
-        """Rasterize features [N, C].
-
-        opacities: [N]. Without them, gradients reach the features alone.
-        """
+        """Rasterize features [N, C]; without opacities [N], gradients reach the features alone."""
         gaussians = self.gaussians
         means, log_scales, quaternions = gaussians.means, gaussians.log_scales, gaussians.quaternions
         if opacities is None:
@@ -382,10 +385,7 @@ class RadianceField(nn.Module):
         opacities: Tensor,
         at_place: bool,
     ) -> Rendering:
-        """Rasterize features along a wide camera's directions; the result has no projected means.
-
-        shapes: means, log_scales and quaternions.
-        """
+        """Rasterize Gaussians' means, log_scales and quaternions along directions; there are no projected means."""
         means, log_scales, quaternions = shapes
         image, transmittance = rasterize_directions(
             means,

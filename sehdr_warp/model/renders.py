@@ -94,15 +94,15 @@ class CameraTensors:
     world_to_camera: Tensor  # [4, 4]
     intrinsics: Tensor  # [4] fx, fy, cx, cy
     position: Tensor  # [3] in the coordinates that world_to_camera maps; for a training, normalized ones
-    directions: Tensor | None = None  # [H, W, 3] unit vectors along which pixels look, world axes; None for a pinhole
+    directions: Tensor | None = None  # [H, W, 3] unit vectors along which pixels look, world axes; None to linearize
 
     @staticmethod
-    def of(camera: Camera, device: torch.device | str) -> "CameraTensors":
-        """Copy a camera to a device."""
+    def of(camera: Camera, device: torch.device | str, *, along_rays: bool = False) -> "CameraTensors":
+        """Copy a camera to a device, a pinhole with the directions of its pixels if `along_rays`."""
         values = camera.world_to_camera, camera.intrinsics, camera.position
         tensors = (torch.tensor(value, dtype=torch.float32, device=device) for value in values)
         directions = None
-        if not camera.is_pinhole:
+        if along_rays or not camera.is_pinhole:
             # Pixels that show nothing do not count; they look along the axis.
             along = np.nan_to_num(pixel_directions(camera)) @ camera.world_to_camera[:3, :3]
             unseen = ~along.any(axis=2, keepdims=True)

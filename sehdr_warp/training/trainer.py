@@ -26,6 +26,7 @@ from torch import Tensor
 
 from ..errors import InputError, SehdrError
 from ..model.color_models import rec709_of
+from ..model.pixel_filter import need_rays
 from ..model.radiance_field import RadianceField
 from ..model.renders import RenderedView
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
@@ -107,8 +108,7 @@ class Trainer:
         self.scene, self.config, self.field, self.ranks = scene, config, field, ranks
         self.output: RunOutput | None = None
         rank, self.batch = (0, 1) if ranks is None else (ranks.rank, ranks.count)
-        self.device = field.gaussians.means.device
-        self.total = config.schedule.iterations
+        self.device, self.total = field.gaussians.means.device, config.schedule.iterations
         self.iteration, self.first_iteration, self.step_batch, self.seconds = 0, 0, 1, 0.0
         normalized = field.normalization.scene(scene)
         views = normalized.train_views
@@ -125,8 +125,8 @@ class Trainer:
             problem = f"view {wide.name} is {wide.camera.projection}, for which densification.strategy = 'adc' has no "
             raise InputError(scene.name, f"{problem}projected centers", "use densification.strategy=mcmc")
         self._can_seed = wide is None
-        depth = point_facts.median_depth
-        self.median_depth = depth_of_points(normalized) if depth is None else depth
+        field.along_rays = need_rays([view.camera for view in views])
+        self.median_depth = point_facts.median_depth or depth_of_points(normalized)
         own_matcher = cache(partial(make_matcher, normalized, field.response, self.device, self.median_depth))
         self._get_matcher: Callable[[], Matcher] | None = get_matcher or own_matcher  # None after the last refinement
 

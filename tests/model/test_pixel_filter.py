@@ -27,7 +27,7 @@ from sehdr_warp.model.renders import CameraTensors
 from sehdr_warp.output.lighting.environment_map import latlong, solid_angles
 from sehdr_warp.rasterizer.reference import project_reference
 from sehdr_warp.response import response_by_name
-from sehdr_warp.scene.wide_camera import pixels_of_directions
+from sehdr_warp.scene.wide_camera import pixel_directions, pixels_of_directions
 
 from ..refusals import call
 
@@ -185,6 +185,25 @@ def test_the_middle_of_a_wide_view_is_that_of_the_photo(antialiased):
     assert not light[0][:, 192:240].any() and light[0].max() > 1
     assert torch.equal(light[1], light[2]), "it is as wide as a photo"
     assert light[2][:, 192:240].max() > 1, "what happens without"
+
+
+@pytest.mark.parametrize("photos", [[], [PHOTO], [PHOTO, FISHEYE], [PHOTO, FISHEYE, FISHEYE], [FISHEYE]], ids=str)
+def test_pinholes_are_drawn_along_their_rays_if_most_photos_are_wide(photos):
+    """A large Gaussian is nearer than another, and behind it by depth; its own depth stays that along the axis."""
+    field = lamp(photos)
+    places, sizes = torch.tensor([[0.9, 0.0, 1.6], [0.45, 0.0, 1.7], [0.0, 9.0, 1.0]]), torch.tensor([0.1, 0.3, 0.1])
+    shapes = {"means": places, "log_scales": sizes.log()[:, None].expand(3, 3)}
+    field.gaussians.overwrite(shapes | {"opacity_logits": torch.tensor([-9.0, 1.0, -9.0])})
+    view = field.render(PHOTO)
+    torch.testing.assert_close(
+        view.depth[view.alpha > 0.01], torch.full((1,), 1.7).expand(int((view.alpha > 0.01).sum()))
+    )
+    field.gaussians.overwrite({"opacity_logits": torch.tensor([1.0, 1.0, -9.0])})
+    field.gaussians.harmonics_dc.data[1] = 0
+    rays = torch.tensor(pixel_directions(PHOTO), dtype=torch.float32)
+    on_sphere = field.render_directions(np.zeros(3), rays, focal_length=40.0, pixel_angle=1 / 40).hdr
+    along_rays = torch.allclose(field.render(PHOTO).hdr, on_sphere, rtol=0.02, atol=0.1)
+    assert along_rays == (sum(camera is FISHEYE for camera in photos) > len(photos) / 2)
 
 
 def test_filters_that_a_render_under_autocast_leaves_are_precise():
