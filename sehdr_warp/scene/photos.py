@@ -118,6 +118,17 @@ def unusable_notes(problems: Sequence[InputError], count: int, *, truth: bool = 
     return [f"{len(problems)} of {count} {files} cannot be used and were left out ({reasons}{more})"]
 
 
+def decoding_problems(photos: Sequence[Path]) -> list[InputError]:
+    """Return the problem of each photo that cannot be decoded."""
+    problems = []
+    for photo in photos:
+        try:
+            read_photo(photo)
+        except InputError as error:
+            problems.append(error)
+    return problems
+
+
 def _most_common_kind(records: Sequence[ImageRecord]) -> tuple[str, list[ImageRecord], list[str]]:
     kinds = Counter(file_kind(record.image) for record in records)
     kind = max(_KINDS, key=lambda each: kinds[each])  # Of equal numbers the first in the table.

@@ -31,7 +31,7 @@ from ..images.exif import exif_texts
 from ..images.ldr_files import LDR_SUFFIXES, PILLOW_ERRORS, exif_of, open_image
 from ..masks import write_reduced
 from ..photo_names import photo_labels
-from ..photos import BRIGHTENING, brightened_codes, read_photo, unusable_notes
+from ..photos import BRIGHTENING, brightened_codes, decoding_problems, read_photo, unusable_notes
 from ..readers.colmap_model import SparseModel, read_model
 from .pairs import FEATURES, MOST_GUIDED, PARTNERS, RATIO, from_one_place, likely_pairs, pairs_with, remove_matches
 from .progress import counted_rows
@@ -58,6 +58,7 @@ class Reconstruction:
     error: float  # Mean reprojection error in pixels, at photos of at most MAX_SIDE pixels
     weak: tuple[int, ...]  # Indices of the photos that share fewer than FEWEST_SHARED points with others
     one_place: bool = False  # See from_one_place()
+    damaged: tuple[int, ...] = ()  # Indices of the photos that cannot be decoded
 
     @property
     def sure(self) -> int:
@@ -66,8 +67,9 @@ class Reconstruction:
 
     def notes(self, photos: Sequence[Path]) -> tuple[str, ...]:
         """Return a line for each reason not to trust the places of the cameras, with the photos concerned."""
-        registered = {int(Path(image.name).stem) for image in self.model.images}
-        unregistered, notes = [i for i in range(len(photos)) if i not in registered], []
+        known = {*self.damaged, *(int(Path(image.name).stem) for image in self.model.images)}
+        unregistered = [i for i in range(len(photos)) if i not in known]
+        notes = unusable_notes(decoding_problems([photos[i] for i in self.damaged]), len(photos))
         names = photo_labels(photos)
         if unregistered:
             were = f"photos could not be placed and {'was' if len(unregistered) == 1 else 'were'} left out"
@@ -75,18 +77,15 @@ class Reconstruction:
             notes.append(f"{count} {were}: {names_left_out}; photos between these and the others help")
         if self.weak:
             shared = "few points with others, so"
-            few = counted(
-                len(self.weak), f"photo shares {shared} its place is", f"photos share {shared} their places are"
-            )
+            one, several = f"photo shares {shared} its place is", f"photos share {shared} their places are"
+            few = counted(len(self.weak), one, several)
             notes.append(f"{few} uncertain: {all_names(names, self.weak)}; more photos in between help")
         if self.one_place:
             turned = "the photos match as if the camera only turned on the spot, which shows no depth"
             notes.append(f"{turned}: views from elsewhere will be wrong; take photos from different places")
         if self.error > MOST_ERROR:
-            notes.append(
-                f"camera positions are uncertain: the mean reprojection error is {self.error:.1f} pixels; "
-                "sharper photos, less motion in the scene and one lens and zoom help"
-            )
+            uncertain = f"camera positions are uncertain: the mean reprojection error is {self.error:.1f} pixels"
+            notes.append(f"{uncertain}; sharper photos, less motion in the scene and one lens and zoom help")
         return tuple(notes)
 
 
@@ -133,9 +132,9 @@ def reconstruct(
             photo_seconds = progress.seconds / count
             progress.update(count)
         _match(database, count, photo_seconds)
-        names = {image_name(i) for i in range(len(photos)) if (work / "images" / image_name(i)).is_file()}
+        names = {image_name(i) for group in groups.values() for i in group}
         again = partial(_match_missing, database, names) if len(photos) <= COMPARED_LIMIT else None
-        model = run_mapper(database, work, len(photos), photos[0].parent, before_again=again)
+        model = run_mapper(database, work, count, photos[0].parent, before_again=again)
         model.write_binary(result)
         placed = [model.images[i] for i in model.reg_image_ids()]
         weak = sorted(int(Path(image.name).stem) for image in placed if image.num_points3D < FEWEST_SHARED)
@@ -147,7 +146,9 @@ def reconstruct(
     model, facts = read_model(folder), {"one_place": False} | json.loads((folder / "facts.json").read_text())
     sized = zip(model.images, (facts["sizes"][int(Path(image.name).stem)] for image in model.images), strict=True)
     images = tuple(replace(image, lens=image.lens.resized(*size)) for image, size in sized)
-    return Reconstruction(replace(model, images=images), facts["error"], tuple(facts["weak"]), facts["one_place"])
+    damaged = tuple(i for i, size in enumerate(facts["sizes"]) if not all(size))
+    others = tuple(facts["weak"]), facts["one_place"], damaged
+    return Reconstruction(replace(model, images=images), facts["error"], *others)
 
 
 def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Path], None]) -> Path:
@@ -177,9 +178,7 @@ def image_name(index: int) -> str:
 
 
 def write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Write oriented 8-bit copies of at most MAX_SIDE pixels.
-
-    Photos that cannot be decoded have no copy, and a warning names them.
+    """Write oriented 8-bit copies of at most MAX_SIDE pixels; photos that cannot be decoded have none.
 
     Returns:
         The oriented full sizes and the copies' sizes, (0, 0) without a copy.
@@ -204,8 +203,7 @@ def write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tupl
         values = np.asarray(image)
         visible |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
         image.save(folder / image_name(i), compress_level=1)
-    for note in unusable_notes(problems, len(photos)):
-        _log.warning("%s", note)
+    unusable_notes(problems, len(photos))
     if not visible:
         problem = "the photos are all black or all white"
         raise InputError(photos[0].parent, problem, "expose them so that the scene shows")
@@ -225,15 +223,12 @@ def exif_device(photo: Path) -> tuple[str, ...]:
 
     RAW and float photos have "None" for all, because a set of them has one camera.
     """
-    if photo.suffix.lower() not in LDR_SUFFIXES:
-        return ("None",) * 4
-    with open_image(photo) as image:
-        try:
+    if photo.suffix.lower() in LDR_SUFFIXES:
+        with open_image(photo) as image, contextlib.suppress(*PILLOW_ERRORS):
             exif = exif_of(image)
             lens = exif.get_ifd(0x8769)
             return exif_texts(exif.get(0x010F), exif.get(0x0110), lens.get(0x920A), lens.get(0xA405))
-        except PILLOW_ERRORS:
-            return ("None",) * 4
+    return ("None",) * 4
 
 
 def extract_features(database: Path, work: Path, names: list[str], params) -> None:

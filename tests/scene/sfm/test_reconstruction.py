@@ -145,6 +145,18 @@ def test_bare_photos_are_placed_undistorted_and_cached(tmp_path, castle_photos, 
     assert not list(Path(os.environ["SEHDR_CACHE"]).glob("sehdr-sfm-*"))
 
 
+def test_a_damaged_photo_is_named_and_not_sought_again(tmp_path, castle_photos, caplog):
+    caplog.set_level("INFO", "sehdr_warp.scene")
+    photos = sorted(shutil.copytree(castle_photos, tmp_path / "photos").iterdir())[:6]
+    photos[5].write_bytes(photos[5].read_bytes()[:-2000])
+    for _ in range(2):  # The second result is the cached one.
+        notes = reconstruct(photos, tmp_path / "cache").notes(photos)
+        damaged = [note for note in notes if "left out" in note]
+        assert len(damaged) == 1
+        assert damaged[0].startswith(f"1 of 6 photos cannot be used and were left out ({photos[5].name}: cannot be dec")
+    assert "using the cached result" in caplog.text and "weaker conditions" not in caplog.text
+
+
 def test_turned_photos_are_placed_upright(tmp_path, shared):
     """Photos stored on their side with an EXIF orientation give the scene of the upright ones."""
     for photo in sorted((shared / "data" / "castle").glob("*.JPG"))[4:8]:
@@ -270,8 +282,9 @@ def test_more_is_matched_of_photos_without_a_place_before_the_second_try(tmp_pat
     assert placed_again == placed and np.greater(after, 1.1 * np.array(before)).all()
 
 
-def test_poor_placement_is_named_with_its_photos():
-    photos = [Path(f"{index}.jpg") for index in range(8)]
+def test_poor_placement_is_named_with_its_photos(tmp_path):
+    photos = [tmp_path / f"{index}.jpg" for index in range(8)]
+    photos[7].write_text("damaged")
     lens = Lens("PINHOLE", 8, 6, (7.0, 7.0, 4.0, 3.0), Path("cameras.bin"))
     images = tuple(ModelImage(f"{index:05d}.png", lens, np.eye(4)) for index in (0, 1, 2, 3, 4, 6))
     model = SparseModel(images, PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32)))
@@ -283,6 +296,9 @@ def test_poor_placement_is_named_with_its_photos():
     assert "1.4 pixels" in error
     lost, _ = Reconstruction(SparseModel(images[:1], model.cloud), 0.5, (0,)).notes(photos)
     assert "7 of 8 photos could not be placed and were left out: 1.jpg to 7.jpg;" in lost
+    damaged, lost = Reconstruction(model, 0.5, (), damaged=(7,)).notes(photos)
+    assert damaged.startswith("1 of 8 photos cannot be used and were left out (7.jpg: is not a readable image")
+    assert lost.startswith("1 of 8 photos could not be placed and was left out: 5.jpg;")
     _, weak, _ = Reconstruction(model, 1.4, (3,)).notes(photos)
     assert weak.startswith("1 photo shares few points with others, so its place is uncertain: 3.jpg;")
 
