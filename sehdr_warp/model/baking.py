@@ -60,7 +60,7 @@ def field_of(gaussians: GaussianArrays) -> RadianceField:
     options |= {"normalization": Normalization(center), "antialiased": gaussians.antialiased}
     options |= {"photo_focals": gaussians.photo_focals and FocalRange(*gaussians.photo_focals)}
     field = RadianceField(model, response_by_name("srgb"), **options).requires_grad_(False)
-    field.photo_filters = gaussians.filters
+    field.photo_filters, field.along_rays = gaussians.filters, gaussians.along_rays
     return field
 
 
@@ -156,6 +156,7 @@ def _arrays_of(field: RadianceField) -> tuple[GaussianArrays, Colors | None]:
     name = field.color_model.name
     facts = {"color_model": name, "base_time": field.base_time, "antialiased": field.antialiased}
     facts |= {"photo_focals": None if field.antialiased else field.photo_focals, "filters": field.photo_filters}
+    facts |= {"along_rays": field.along_rays}
     gaussians = GaussianArrays(**tensors, harmonics=harmonics, **facts)
     if field.color_model.display_referred:
         return gaussians, lambda encoded: field.response.decode(np.clip(encoded, 0, 1)) / field.base_time

@@ -47,6 +47,8 @@ class PagedField(RadianceField):
         )
         self.confidence, self.clipped_stops = field.confidence, field.clipped_stops
         self.photo_filters = field.photo_filters
+        if field.along_rays:  # As a file states; that of a run follows from its cameras.
+            self.along_rays = True
         self._device, self.budget = device, budget
         tensors = field.gaussians.tensors()
         self._low, self._high = boxes_around(tensors["means"], tensors["log_scales"], CELL)
@@ -153,7 +155,7 @@ class PagedField(RadianceField):
         joined = {name: torch.cat([page[name] for page in pages]) for name in pages[0]}
         part = RadianceField(Gaussians(**joined), self.response, fusion=self.fusion, **_options(self))
         part.requires_grad_(False)
-        part.photo_cameras = self.photo_cameras
+        part.photo_cameras, part.along_rays = self.photo_cameras, self.along_rays
         if self.filters is not None:
             mean, least = self.filters
             least = None if least is None else self._of_rows(least, levels)

@@ -33,8 +33,6 @@ MOST_CAMERAS, MOST_PROJECTIONS = 128, 1 << 27
 MOST_AXES = 32  # Photos by whose axes maps order Gaussians
 MOST_PIXELS = 1 << 23  # Of a render that is averaged; a wider view is rendered less fine.
 ROWS, ROWS_GPU = 1 << 17, 1 << 20  # Gaussians that are projected at once: each takes 100 bytes meanwhile.
-WIDE_LIMIT = 0.3
-"""Ray at which pages, which draw no rays, linearize a scene of wide photos: views of two rooms gain 3 to 6 dB."""
 NO_PIXEL = 1e6  # Pixels: the focal length of cameras whose pixels have next to no size
 NEAR = 1e-6  # Gaussians nearer than this, or behind the camera, are not drawn.
 REACH = 3.4  # Standard deviations at which opaque Gaussians end: their alpha is below the threshold.
@@ -157,12 +155,11 @@ class RayLimits(NamedTuple):
     y: float
 
     @staticmethod
-    def of(cameras: Sequence[Camera]) -> "RayLimits":
-        """Return those at which the rasterizer linearizes any photo that is a pinhole, else WIDE_LIMIT."""
+    def of(cameras: Iterable[Camera]) -> "RayLimits":
+        """Return those of the cameras that are pinholes, at which the rasterizer linearizes photos."""
         pinholes = [camera for camera in cameras if camera.is_pinhole]
         if not pinholes:
-            limit = WIDE_LIMIT if cameras else math.inf
-            return RayLimits(limit, limit)
+            return RayLimits(math.inf, math.inf)
         sides = [
             (max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy, c.width / c.fx, c.height / c.fy)
             for c in pinholes
@@ -170,6 +167,10 @@ class RayLimits(NamedTuple):
         x, y, width, height = np.transpose(sides)
         x, y = x + FRUSTUM_MARGIN * width / 2, y + FRUSTUM_MARGIN * height / 2
         return RayLimits(*((1 + ROUNDING) * float(limits.max()) for limits in (x, y)))
+
+
+WIDE_LIMITS = RayLimits(0.3, 0.3)
+"""Of pages, which draw no rays, of scenes that need_rays(): views of two rooms gain 3 to 6 dB."""
 
 
 def options_of_view(

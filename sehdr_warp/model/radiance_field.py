@@ -102,11 +102,11 @@ class RadianceField(nn.Module):
     @cached_property
     def ray_limits(self) -> RayLimits:
         """Rays up to which views are linearized."""
-        return RayLimits.of(self.photo_cameras)
+        return pixel_filter.WIDE_LIMITS if self.along_rays else RayLimits.of(self.photo_cameras)
 
     @cached_property
     def along_rays(self) -> bool:
-        """True if pinholes, too, are drawn along the rays of their pixels, see need_rays(); Trainer sets it."""
+        """True if pinholes, too, are drawn along their pixels' rays, see need_rays(); trainings and files set it."""
         return pixel_filter.need_rays(self.photo_cameras)
 
     def camera_tensors(self, camera: Camera) -> CameraTensors:

@@ -47,6 +47,7 @@ class GaussianArrays:
         filters: [N] standard deviations of the low-pass filter of the photos where the Gaussians are, in the unit of
             the means; see with_filter(). None if they are not known.
         photo_focals: Least and largest focal length of the photos, pixels; None if they are not known.
+        along_rays: To be drawn along the rays of pixels, as most photos are panoramas or fisheye; see RadianceField.
     """
 
     means: np.ndarray
@@ -60,6 +61,7 @@ class GaussianArrays:
     antialiased: bool = False
     filters: np.ndarray | None = None
     photo_focals: tuple[float, float] | None = None
+    along_rays: bool = False
 
     @property
     def count(self) -> int:
@@ -205,6 +207,7 @@ def join_gaussians(parts: Sequence[GaussianArrays]) -> GaussianArrays:
         padded[0],
         filters=np.concatenate(filters) if len(filters) == len(parts) else None,
         photo_focals=(min(least), max(most)) if all(least) else None,
+        along_rays=all(part.along_rays for part in parts),
         **{name: np.concatenate([getattr(part, name) for part in padded]) for name in _ARRAYS},
     )
 
@@ -233,6 +236,8 @@ def stated_facts(gaussians: GaussianArrays) -> dict[str, Any]:
     facts: dict[str, Any] = {"base_exposure_time": gaussians.base_time}
     if gaussians.photo_focals is not None:
         facts["photo_focals"] = list(gaussians.photo_focals)
+    if gaussians.along_rays:
+        facts["along_rays"] = True
     if gaussians.world_matrix is not None:
         facts["world_matrix"] = gaussians.world_matrix.tolist()
     return facts
@@ -245,6 +250,7 @@ def read_facts(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
         InputError: If focal lengths are not two positive numbers in order, or the matrix is not a similarity.
     """
     result: dict[str, Any] = {"base_time": math.nan}  # GaussianArrays.checked() refuses it.
+    result["along_rays"] = str(facts.get("along_rays")).lower() in ("true", "1.0")  # OpenUSD's is a number.
     with suppress(TypeError, ValueError, OverflowError):
         result["base_time"] = float(facts.get("base_exposure_time", 1.0))
     if (focals := facts.get("photo_focals")) is not None:

@@ -20,6 +20,7 @@ COLOR_SPACE = "lin_rec709_scene"
 _FACTS = {
     "base_exposure_time": ("sehdr:baseExposureTime", "Double"),
     "photo_focals": ("sehdr:photoFocals", "DoubleArray"),
+    "along_rays": ("sehdr:alongRays", "Bool"),
     "world_matrix": ("sehdr:worldMatrix", "Matrix4d"),
 }
 """Attribute and its type for each of stated_facts()."""

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from sehdr_warp.model.paged_field import PagedField
 from sehdr_warp.model.pixel_filter import RayLimits
+from sehdr_warp.output.export.gaussians import export
 from sehdr_warp.output.merged_scene import merge_scenes
 from sehdr_warp.output.scene_page import write_scene_page
+from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.scene.wide_camera import solid_angles
 from sehdr_warp.training.train import create_trainer
@@ -68,6 +71,21 @@ def test_pictures_of_the_training_and_of_merged_runs_are_those_of_the_run(traine
     assert merge_scenes(run, run).field.along_rays
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb", ".usdc", ".sog"])
+def test_files_are_drawn_as_the_run_is(trained, tmp_path, monkeypatch, suffix):
+    _, run, views = trained
+    scene = load_splats(export(run, tmp_path / f"scene{suffix}", axes="scene"))
+    along_rays = mean_psnr(scene, views)
+    assert along_rays == pytest.approx(mean_psnr(run, views), abs=1.0)
+    camera = views[0].camera
+    paged = PagedField(scene.field, torch.device("cpu"), budget=10**9)
+    torch.testing.assert_close(paged.render(camera).hdr, scene.field.render(camera).hdr)
+    monkeypatch.setattr(scene.field, "along_rays", False)
+    assert mean_psnr(scene, views) < along_rays - 0.5
+
+
 def test_pages_which_draw_no_rays_keep_gaussians_beside_the_view_out_of_it(trained, tmp_path):
-    page = write_scene_page(trained[1], tmp_path / "scene.html").read_text()
-    assert '"rays": [0.3, 0.3]' in page
+    run = trained[1]
+    for scene in (run, load_splats(export(run, tmp_path / "scene.ply"))):
+        page = write_scene_page(scene, tmp_path / "scene.html", overwrite=True)
+        assert '"rays": [0.3, 0.3]' in page.read_text()
