@@ -111,6 +111,7 @@ class RenderableScene:
             InputError: for another name.
         """
         sources = {"confidence": lambda: self.field.confidence, "clipped": self.clipped_share}
+        data = (data,) if isinstance(data, str) else data
         if unknown := [name for name in data if name not in sources]:
             raise InputError("data", f"has {unknown[0]!r}", f"name any of {', '.join(sources)}")
         factor = self.samples_across_pixel(camera) if supersample else 1

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import resources
 from itertools import chain
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -98,8 +99,8 @@ def load_scene(
     """
     from ..response import response_by_name, responses_named
 
-    if max_size is not None and max_size < 1:
-        raise InputError(path, f"longest side of {max_size} pixels asked for", "give at least 1 pixel")
+    if max_size is not None and not (isinstance(max_size, Real) and max_size >= 1):
+        raise InputError(path, f"longest side of {max_size!r:.60} pixels asked for", "give at least 1 pixel")
     if isinstance(response, str | Path) and str(response) not in ("auto", "learned", "linear"):
         response_by_name(response)  # An unknown name is refused before the photos are read.
     for candidate in candidates:

@@ -26,6 +26,8 @@ def test_a_coarse_view_is_the_mean_of_finer_pixels_with_its_data(embedded_run):
     assert not torch.allclose(run.render(half, supersample=False).hdr, mean, rtol=1e-4, atol=1e-5)
     with pytest.raises(InputError, match="data: has 'normals'; name any of confidence, clipped"):
         run.render(camera, data=("normals",))
+    with pytest.raises(InputError, match="data: has 'normals'; name any of confidence, clipped"):
+        run.render(camera, data="normals")
     for wrong in (run.cameras[0], run.cameras[0].name, None):
         with pytest.raises(TypeError, match=rf"camera is a {type(wrong).__name__}, expected a Camera, as run.cameras"):
             run.render(wrong)

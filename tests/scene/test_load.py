@@ -36,6 +36,13 @@ def test_layouts_without_a_protocol_hold_out_the_middle_of_each_block(tmp_path):
     assert holdout_indices(13, 5, None, {6, 7, 8}) == {2, 5}
 
 
+@pytest.mark.parametrize("max_size", [0, -5, "800", float("nan")])
+def test_a_size_that_no_photo_has_is_named(tmp_path, max_size):
+    write_blender(tmp_path)
+    with pytest.raises(InputError, match=f"longest side of {max_size!r} pixels asked for; give at least 1 pixel"):
+        load(tmp_path, max_size=max_size)
+
+
 def test_the_package_and_the_room_are_light():
     """Without poses to check and lenses that distort, nothing of structure from motion is needed."""
     heavy = "{'torch', 'warp', 'pycolmap', 'OpenEXR', 'scipy', 'matplotlib', 'colour'}"

@@ -35,6 +35,7 @@ def find_view(run: "RenderableScene", name: str) -> "CameraEntry":
     if not views:
         remedy = "give a run, or keep what `export --cameras` writes beside a file"
         raise SehdrError(f"{run.path}: has no cameras, and so no view {name!r}; {remedy}")
+    name = str(name)
     names = [each for each in (name, *view_names_of(name)) if each in views]
     if not names:
         some = first_names(list(views), 5)

@@ -7,6 +7,7 @@ kept with the run; files then state it, and lights are written in cd/m^2.
 import logging
 import math
 from dataclasses import asdict, dataclass
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,11 +89,21 @@ def meter(
         area: Side of the square, in pixels, whose mean light is compared.
 
     Raises:
+        TypeError: For a reading that is not a number.
         SehdrError: For a view or place that is not there, or values that cannot be.
     """
     refuse_paths("load_run", run)
-    entry, (x, y) = find_view(run, view), pixel
+    entry = find_view(run, view)
     view, camera = entry.name, entry.camera
+    try:
+        x, y = map(float, pixel)
+    except (TypeError, ValueError):
+        raise SehdrError(f"pixel {pixel!r:.60} is not two numbers, x and y") from None
+    for name, value in {"luminance": luminance, "illuminance": illuminance, "reflectance": reflectance}.items():
+        if not isinstance(value, Real | None):
+            raise TypeError(f"{name} is {value!r:.60}, expected a number")
+    if not isinstance(area, Integral) or area < 1:
+        raise SehdrError(f"area {area!r:.60} is not a number of pixels, 1 or more")
     if (luminance is None) == (illuminance is None):
         raise SehdrError("a reading is one of luminance, in cd/m^2, and illuminance, in lux")
     if luminance is not None and reflectance != GREY_CARD:

@@ -119,10 +119,16 @@ def test_a_clipped_place_is_named(run, caplog):
         ({"luminance": math.nan}, "not a positive number"),
         ({"illuminance": 5.0, "reflectance": 18.0}, "reflectance 18"),
         ({"luminance": 1e300}, "is not between"),
+        ({"luminance": "5"}, "luminance is '5', expected a number"),
+        ({"view": 3, "luminance": 5.0}, "view '3' is not one of the scene's"),
+        ({"pixel": (16,), "luminance": 5.0}, r"pixel \(16,\) is not two numbers"),
+        ({"pixel": 16, "luminance": 5.0}, "pixel 16 is not two numbers"),
+        ({"area": 0, "luminance": 5.0}, "area 0 is not a number of pixels"),
+        ({"area": 1.5, "luminance": 5.0}, "area 1.5 is not a number of pixels"),
     ],
 )
 def test_readings_that_cannot_be_are_refused(run, options, problem):
-    with pytest.raises(SehdrError, match=problem):
+    with pytest.raises((SehdrError, TypeError), match=problem):
         meter(run, **{"view": "r_0", "pixel": (16, 12)} | options)
     assert not (run.path / LIGHT_UNIT_FILE).exists()
 
