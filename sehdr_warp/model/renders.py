@@ -100,15 +100,24 @@ class CameraTensors:
     def of(camera: Camera, device: torch.device | str, *, along_rays: bool = False) -> "CameraTensors":
         """Copy a camera to a device, a pinhole with the directions of its pixels if `along_rays`."""
         values = camera.world_to_camera, camera.intrinsics, camera.position
-        tensors = (torch.tensor(value, dtype=torch.float32, device=device) for value in values)
-        directions = None
-        if along_rays or not camera.is_pinhole:
+        pose, *others = (torch.tensor(value, dtype=torch.float32, device=device) for value in values)
+        if camera.is_pinhole:
+            directions = _rays(camera, pose) if along_rays else None
+        else:
             # Pixels that show nothing do not count; they look along the axis.
             along = np.nan_to_num(pixel_directions(camera)) @ camera.world_to_camera[:3, :3]
             unseen = ~along.any(axis=2, keepdims=True)
             along = np.where(unseen, camera.world_to_camera[2, :3], along)
             directions = torch.tensor(along, dtype=torch.float32, device=device)
-        return CameraTensors(camera.width, camera.height, *tensors, directions)  # pyright: ignore[reportCallIssue]
+        return CameraTensors(camera.width, camera.height, pose, *others, directions)  # pyright: ignore[reportCallIssue]
+
+
+def _rays(camera: Camera, pose: Tensor) -> Tensor:
+    """Return pixel_directions() of a pinhole in world axes, computed on the device of its pose for every picture."""
+    columns, rows = (torch.arange(size, device=pose.device) + 0.5 for size in (camera.width, camera.height))
+    x, y = torch.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, indexing="xy")
+    along = x[..., None] * pose[0, :3] + y[..., None] * pose[1, :3] + pose[2, :3]
+    return along / along.norm(dim=2, keepdim=True)
 
 
 def require_time(time: object) -> None:
