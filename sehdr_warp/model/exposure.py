@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from itertools import pairwise
+from numbers import Real
 from typing import TYPE_CHECKING
 
 from ..errors import SehdrError
@@ -51,8 +52,10 @@ def read_exposures(items: Exposures, base_time: float | None, field: str = "expo
     Raises:
         SehdrError: If an item is not an exposure, or two are equal.
     """
-    if base_time is not None and not 0 < base_time < math.inf:
-        raise SehdrError(f"base exposure time = {base_time} is not a positive number of seconds; give the photos' one")
+    if base_time is not None and not (isinstance(base_time, Real) and 0 < base_time < math.inf):
+        raise SehdrError(
+            f"base exposure time = {base_time!r:.60} is not a positive number of seconds; give the photos' one"
+        )
     parsed = sorted(_exposures(items, base_time, field), key=lambda exposure: exposure.time)
     if not parsed:
         raise SehdrError(f"{field}: the list is empty; give {_FORMS}")

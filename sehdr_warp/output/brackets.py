@@ -125,6 +125,8 @@ def write_brackets(
     )
     pairs: Any = views.items() if isinstance(views, Mapping) else views
     radiances: list[tuple[str, np.ndarray]] = list(pairs)
+    if not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in radiances):
+        raise TypeError("views is neither a dict of names and their radiance [H, W, 3] nor a list of such pairs")
     with writer.open(overwrite):
         for file_name, (name, radiance) in zip(safe_names([name for name, _ in radiances]), radiances, strict=True):
             writer.write(file_name, radiance, (cameras or {}).get(name))
@@ -210,7 +212,7 @@ class BracketWriter:
         Simulated photos encode this radiance, so that merging them by the response gives it back.
         """
         radiance = np.asarray(radiance, np.float64)
-        if radiance.shape[2:] != (3,):
+        if radiance.shape[2:] != (3,) or not radiance.size:
             raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
         check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
         # One type for all exposures of a view, so that their ratios keep one precision.

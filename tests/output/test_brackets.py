@@ -43,6 +43,8 @@ def test_unusable_exposures_name_the_value(words, message):
         bracket_exposures(0.5, **words)
     with pytest.raises(SehdrError, match="base exposure time = -1"):
         bracket_exposures(-1, evs=[0])
+    with pytest.raises(SehdrError, match="base exposure time = '1/125' is not a positive number of seconds"):
+        bracket_exposures("1/125", evs=[0])
 
 
 @pytest.mark.parametrize("pixel, dtype", [("half", np.float16), ("float", np.float32)])
@@ -160,7 +162,14 @@ def test_exif_times_are_simple_fractions():
         assert (value.numerator, value.denominator) == expected
 
 
-def test_unusable_options():
+def test_unusable_options(tmp_path):
+    picture = np.ones((3, 4, 3), np.float32)
+    for views in ([picture], picture, [("a", picture, 1)]):
+        with pytest.raises(TypeError, match="views is neither a dict of names and their radiance"):
+            write_brackets(tmp_path / "x", views, 1, evs=[0])
+    with pytest.raises(ValueError, match=r"radiance has shape \(0, 4, 3\), not \[H, W, 3\]"):
+        write_brackets(tmp_path / "x", {"a": picture[:0]}, 1, evs=[0])
+    assert not list(tmp_path.iterdir())
     with pytest.raises(SehdrError, match="'gif' are not one of"):
         write_brackets("x", {}, 1, evs=[0], ldr="gif", response=GammaResponse())
     with pytest.raises(SehdrError, match="need a camera response"):

@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +88,9 @@ def export(
         InputError: For an unknown suffix, if a file exists, or if a value is not finite.
     """
     refuse_paths("load_run", run)
-    path, edits = Path(path), edits or SplatEdits()
+    path, edits = Path(path), SplatEdits() if edits is None else edits
+    if not isinstance(edits, SplatEdits):
+        raise TypeError(f"edits is a {type(edits).__name__}, expected SplatEdits, such as SplatEdits(min_views=2)")
     file_model = required_color_model(path)
     kind = kind or ("hdr" if file_model == "linear" else "ldr")
     _check(path, kind, file_model, exposure_time, degree)
@@ -174,8 +177,8 @@ def _check(path: Path, kind: str, file_model: str | None, exposure_time: float |
         raise InputError(path, f"{check_suffix(path)} {limit}, and kind {kind} is not", "leave the kind out")
     if exposure_time is not None and kind == "hdr":
         raise SehdrError("an HDR file has no exposure time; leave it out, or write kind ldr")
-    if exposure_time is not None and not 0 < exposure_time < math.inf:
-        raise SehdrError(f"exposure time {exposure_time:g} is not positive and finite; give seconds")
+    if exposure_time is not None and not (isinstance(exposure_time, Real) and 0 < exposure_time < math.inf):
+        raise SehdrError(f"exposure time {exposure_time!r:.60} is not positive and finite; give seconds")
     if degree is not None and not 0 <= degree <= 3:
         raise SehdrError(f"harmonics of degree {degree} are not supported; give 0 to 3")
 

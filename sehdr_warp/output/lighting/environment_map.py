@@ -3,6 +3,7 @@
 import json
 import logging
 from dataclasses import dataclass, fields, replace
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -181,8 +182,8 @@ def check_map(path: Path, size: int | None, layout: str, axes: str, beyond: floa
     for name, value, allowed in (("layout", layout, LAYOUTS), ("axes", axes, AXES)):
         if value not in allowed:
             raise SehdrError(f"{name} {value!r} is not one of {', '.join(allowed)}")
-    if size is not None and (size < 16 or size % 2 or size > _LARGEST):
-        raise SehdrError(f"size {size} is not usable; give an even number of pixels from 16 to {_LARGEST}")
+    if size is not None and not (isinstance(size, Integral) and 16 <= size <= _LARGEST and size % 2 == 0):
+        raise SehdrError(f"size {size!r:.60} is not usable; give an even number of pixels from 16 to {_LARGEST}")
     check_beyond(beyond)
 
 

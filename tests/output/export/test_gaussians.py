@@ -129,13 +129,15 @@ def test_unusable_requests(tmp_path, run):
     for name, options, words in (
         ("a.ply", {"kind": "sdr"}, "'sdr' is not one of ldr, hdr"),
         ("a.ply", {"exposure_time": 0}, "exposure time 0 is not"),
+        ("a.ply", {"exposure_time": "1/125"}, "exposure time '1/125' is not"),
+        ("a.ply", {"edits": {"min_views": 2}}, "edits is a dict, expected SplatEdits"),
         ("a.ply", {"kind": "hdr", "exposure_time": 1}, "has no exposure time"),
         ("a.ply", {"degree": 4}, "degree 4"),
         ("a.glb", {"kind": "hdr"}, "knows display colors only"),
         ("a.usdc", {"kind": "ldr"}, "is tagged as scene-linear"),
         ("a.splat", {}, "a.splat: .splat is not read or written here: it holds 8 bits and no harmonics"),
     ):
-        with pytest.raises(SehdrError, match=words):
+        with pytest.raises((SehdrError, TypeError), match=words):
             export(run, tmp_path / name, **options)
     assert list(tmp_path.iterdir()) == []
 

@@ -203,6 +203,7 @@ def test_points_and_options_that_cannot_be(tmp_path, run, logged):
         ({"at": "1,2,nan"}, "neither"),
         ({"at": "1e6,2e6,3e6", "scale": 2.0}, r"from \(1e\+06, 2e\+06, 3e\+06\) nothing of the scene is seen"),
         ({"size": 7}, "size 7 is not usable"),
+        ({"size": "64"}, "size '64' is not usable"),
         ({"layout": "ball"}, "is not one of latlong, cube"),
         *(({"beyond": beyond}, "not a distance") for beyond in (-1.0, np.inf, np.nan)),
     ):
