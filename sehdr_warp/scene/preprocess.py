@@ -209,8 +209,8 @@ class _Preprocessor:
         photo, encoding = _read_stored(record, self.gain_map_problems, oriented=oriented, masked=self.alpha == "mask")
         if photo.levels > 255 and file_kind(record.image) == "encoded" and record.gain_map_scale is None:
             self.largest_code = max(self.largest_code, int(photo.pixels.max()))
-        if photo.rounds_colors and photo.levels == 255 and photo.above_white is None:
-            photo = replace(photo, pixels=with_whole_white(photo.pixels))
+        if photo.white_from is not None and photo.levels == 255 and photo.above_white is None:
+            photo = replace(photo, pixels=with_whole_white(photo.pixels, photo.white_from))
         masks = resample.borders()
         if stored is not None:
             masks.append(resample(stored))

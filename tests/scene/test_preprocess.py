@@ -86,6 +86,7 @@ def test_alpha_keeps_pixels_out(tmp_path):
         ("png", {"quality": 92, "format": "JPEG"}, True),
         ("avif", {"quality": 92}, True),
         ("webp", {"quality": 92}, True),
+        ("webp", {"quality": 75}, True),
         ("webp", {"quality": 92, "exif": Image.Exif().tobytes(), "icc_profile": b"odd"}, True),
         ("webp", {"lossless": True, "quality": 92, "exif": Image.Exif().tobytes()}, False),
         ("webp", {"lossless": True}, False),

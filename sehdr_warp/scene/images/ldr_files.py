@@ -40,7 +40,7 @@ _BLOCK, _AROUND, _LEAST_WHITE, _NEAR_WHITE = 8, 3, 0.1, 250
 """Codes of a photo that rounds colors are white from _NEAR_WHITE, if this part of their channel is in the _AROUND x
 _AROUND blocks around them."""
 _opening = threading.Lock()  # Pillow's pixel limit, which is lifted while opening, is shared by all threads
-_ROUNDS_COLORS = "JPEG", "MPO", "HEIF", "AVIF"  # Formats that store colors coarser than brightness; lossy WebP too
+_ROUNDS_COLORS = "JPEG", "MPO", "HEIF", "AVIF"  # Store colors coarser than brightness, as lossy WebP, with 220 levels
 _FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "AVIF")
 _MODES = ("L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "I", "I;16", "I;16L", "I;16B", "I;16N")
 _OTHER_MODES = {
@@ -76,7 +76,7 @@ class EncodedImage:
     alpha: np.ndarray | None  # [H, W] float32 in [0, 1]; None if all is opaque
     above_white: np.ndarray | None = None  # [H, W, 3] float16, light over white's; 0 if unknown. None if not stated
     above_white_deviation: float = 0.0  # Standard deviation of the natural logarithm of above_white
-    rounds_colors: bool = False  # Whether its format stores colors coarser than brightness, see with_whole_white()
+    white_from: int | None = None  # Least code of white if its format rounds colors, see with_whole_white()
 
     @property
     def levels(self) -> int:
@@ -112,18 +112,18 @@ def read_ldr(path: Path, *, oriented: bool = False, mask: bool = False) -> Encod
                 file_orientation = orientation_of(image) if image.format == "TIFF" else 1
                 pixels, alpha = _decode(image, path)
             turn = turn_of_loaded(image, file_orientation, oriented=oriented)
-            rounds = _is_lossy_webp(path) if image.format == "WEBP" else image.format in _ROUNDS_COLORS
+            white_from = 254 if _is_lossy_webp(path) else 255 if image.format in _ROUNDS_COLORS else None
         except PILLOW_ERRORS as error:
             raise InputError(path, f"cannot be decoded ({error})", DAMAGED) from None
     alpha = None if alpha is None else turn_upright(alpha, turn)
-    return EncodedImage(turn_upright(pixels, turn), alpha, rounds_colors=rounds)
+    return EncodedImage(turn_upright(pixels, turn), alpha, white_from=white_from)
 
 
 def _is_lossy_webp(path: Path) -> bool:
-    """Return whether a WebP's pixels are in the lossy chunk; chunks of its profile and alpha stand before it."""
+    """Return whether a file is a WebP with a lossy chunk of pixels; chunks of its profile and alpha stand before it."""
     with path.open("rb") as file:
-        file.seek(12)
-        while len(head := file.read(8)) == 8:
+        is_webp = file.read(12)[8:] == b"WEBP"
+        while is_webp and len(head := file.read(8)) == 8:
             kind, length = struct.unpack("<4sI", head)
             if kind in (b"VP8 ", b"VP8L"):
                 return kind == b"VP8 "
@@ -131,13 +131,13 @@ def _is_lossy_webp(path: Path) -> bool:
     return False
 
 
-def with_whole_white(codes: np.ndarray) -> np.ndarray:
+def with_whole_white(codes: np.ndarray, white_from: int) -> np.ndarray:
     """Return the codes [H, W, 3] of 8 bits of a photo, in which those are white that its compression made darker.
 
     It rounds colors, so up to half of the values of a lamp that clips in one channel have a code below 255. Each would
     hold the lamp at white, against darker photos.
     """
-    white = codes == 255
+    white = codes >= white_from
     if not white.any():
         return codes
     height, width, _ = codes.shape
