@@ -24,7 +24,7 @@ from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
 from .pixel_filter import FocalRange, PhotoFilters, RayLimits
-from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, unpremultiply
+from .renders import Background, CameraTensors, DirectionalRender, PhotoRender, RenderedView, unpremultiply
 
 NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
 _PIXELS_AT_ONCE = 1 << 19  # Of which colors are decoded
@@ -126,6 +126,7 @@ class RadianceField(nn.Module):
         encode: bool = True,
         opacity_factors: Tensor | None = None,
         order_axis: Tensor | None = None,
+        background: Background | None = None,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
     ) -> PhotoRender:
         """Render what a photo shows, differentiably: for training steps, render_ldr(), and fits to pictures.
@@ -139,30 +140,30 @@ class RadianceField(nn.Module):
             encode: If False, `encoded` stays None if `photo_exposure` is available.
             opacity_factors: [N] factors on the opacities that are rendered, at most 1, such as those of a dropout.
             order_axis: As in rasterize(); wide cameras order by distance.
+            background: Color behind the Gaussians; by default black.
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
                 harmonics have in this direction; the harmonics themselves then get no gradient.
         """
         opacities = self.gaussians.opacities()
-        rendered_opacities = opacities if opacity_factors is None else (opacities * opacity_factors).clamp(max=1)
-        options: dict[str, Any] = {"max_intersections": max_intersections, "order_axis": order_axis}
+        rendered = opacities if opacity_factors is None else (opacities * opacity_factors).clamp(max=1)
+        options = {"max_intersections": max_intersections, "order_axis": order_axis, "opacities": rendered}
         ratio = exposure_time / self.base_time
         values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.display_referred:
-            rendering = self._rasterize(
-                camera, self.color_model.colors(values), opacities=rendered_opacities, **options
-            )
-            image = rendering.image
+            rendering = self._rasterize(camera, self.color_model.colors(values), **options)
+            image = rendering.image if background is None else background.behind(rendering, ["encoded"])
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
             return PhotoRender(image, None, None, rendering, opacities=opacities)
         color_sets = self._color_sets(values, ratio, extra_images)
         first, *others = color_sets.values()
         features = torch.cat([first, *others], dim=1) if others else first
-        rendering = self._rasterize(camera, features, opacities=rendered_opacities, **options)
+        rendering = self._rasterize(camera, features, **options)
+        image = rendering.image if background is None else background.behind(rendering, color_sets)
         # A single image is not split, because the derivative of a split is a copy.
-        parts = rendering.image.split(3, dim=2) if others else (rendering.image,)
+        parts = image.split(3, dim=2) if others else (image,)
         images = dict(zip(color_sets, parts, strict=True))
         encoded, exposure, photo_exposure = images.get("encoded"), images.get("exposure"), None
         if self.tone_map == "pixel":
@@ -364,9 +365,8 @@ class RadianceField(nn.Module):
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities, at_place)
         lens = camera.world_to_camera, camera.intrinsics, camera.width, camera.height
-        arguments = means, view.log_scales, quaternions, opacities, features, *lens
         return self.rasterizer(  # rasterize(), see the class
-            *arguments,
+            *(*shapes, opacities, features, *lens),
             eps2d=view.eps2d,
             ray_limit_x=view.ray_limit_x,
             ray_limit_y=view.ray_limit_y,

@@ -93,7 +93,18 @@ def preprocess(
     notes = (*dataset.notes, *damaged, *masks, *([keeper.note] if keeper.note else []))
     points, colors = dataset.cloud
     times_known = dataset.times_known
-    return Scene(dataset.name, dataset.format, tuple(views), points, colors, times_known, notes, response=response)
+    black = bool(preprocessor.transparent) and dataset.alpha == "background"
+    return Scene(
+        dataset.name,
+        dataset.format,
+        tuple(views),
+        points,
+        colors,
+        times_known,
+        notes,
+        response=response,
+        black_background=black,
+    )
 
 
 def _cropped_note(cropped: Mapping[Path, float], dataset: DataparserOutputs) -> list[str]:

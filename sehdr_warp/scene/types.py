@@ -99,6 +99,7 @@ class Scene:
         photos_normalized: True if the photos were normalized; see ExposureCompensation.normalize_photos.
         color_matrix: [3, 3] from the primaries of the codes' light to linear Rec.709; None if these are Rec.709.
         unplaced: number of photos without a camera, which are in no view.
+        black_background: True if photos have transparent parts that count as black light, as rendered sets do.
     """
 
     name: str
@@ -114,6 +115,7 @@ class Scene:
     light_known: bool = False
     photos_normalized: bool = False
     unplaced: int = 0
+    black_background: bool = False
 
     def __repr__(self) -> str:
         """Return name, format, number of views and their size in one line."""
