@@ -203,7 +203,7 @@ def write_photos(photos, folder: Path) -> tuple[list[tuple[int, int]], list[tupl
         values = np.asarray(image)
         visible |= bool(((values > 2) & (values < 253)).mean() > 1e-3)
         image.save(folder / image_name(i), compress_level=1)
-    unusable_notes(problems, len(photos))
+    unusable_notes(problems, len(photos))  # Raises if these are most of them; Reconstruction.notes() has the line.
     if not visible:
         problem = "the photos are all black or all white"
         raise InputError(photos[0].parent, problem, "expose them so that the scene shows")
