@@ -145,8 +145,8 @@ class RadianceField(nn.Module):
                 harmonics have in this direction; the harmonics themselves then get no gradient.
         """
         opacities = self.gaussians.opacities()
-        rendered = opacities if opacity_factors is None else (opacities * opacity_factors).clamp(max=1)
-        options = {"max_intersections": max_intersections, "order_axis": order_axis, "opacities": rendered}
+        visible = opacities if opacity_factors is None else (opacities * opacity_factors).clamp(max=1)
+        options = {"max_intersections": max_intersections, "order_axis": order_axis, "opacities": visible}
         ratio = exposure_time / self.base_time
         values = self._evaluate_sh(camera.position, degree, detach_harmonics=sh_gradient_hook is not None)
         if sh_gradient_hook is not None:

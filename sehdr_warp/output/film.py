@@ -117,8 +117,8 @@ def write_film(
     av, kind = film_library(), TRANSFERS[transfer]
     out, first, container_format = Path(out), cameras[0], film_format(out)
     check_rate(fps)
-    framed = _at_one_size(cameras, out)
-    width, height = framed[0].width, framed[0].height
+    frames = _at_one_size(cameras, out)
+    width, height = frames[0].width, frames[0].height
     aspect = first.fy / first.fx if first.is_pinhole else 1.0  # Width of a pixel over its height
     gain = run.base_time * display_gain(run.response)
     stops = np.linspace(*ev_ramp, len(cameras))
@@ -133,7 +133,7 @@ def write_film(
                 stream = _add_stream(container, kind, fps, width, height, len(cameras))
                 if abs(aspect - 1) > _SQUARE:
                     stream.codec_context.sample_aspect_ratio = Fraction(aspect).limit_denominator(100)
-                for camera, ev in zip(_with_progress(framed, out, tell), stops):
+                for camera, ev in zip(_with_progress(frames, out, tell), stops):
                     hdr = run.render(camera).hdr.cpu().numpy() * np.float32(2.0**ev)
                     encoded = tone_map(hdr) if tone_map else encode(hdr * np.float32(gain), transfer)
                     for packet in stream.encode(_frame(av, encoded, kind)):

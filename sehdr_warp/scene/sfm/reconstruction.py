@@ -67,8 +67,8 @@ class Reconstruction:
 
     def notes(self, photos: Sequence[Path]) -> tuple[str, ...]:
         """Return a line for each reason not to trust the places of the cameras, with the photos concerned."""
-        known = {*self.damaged, *(int(Path(image.name).stem) for image in self.model.images)}
-        unregistered = [i for i in range(len(photos)) if i not in known]
+        placed_or_damaged = {*self.damaged, *(int(Path(image.name).stem) for image in self.model.images)}
+        unregistered = [i for i in range(len(photos)) if i not in placed_or_damaged]
         notes = unusable_notes(decoding_problems([photos[i] for i in self.damaged]), len(photos))
         names = photo_labels(photos)
         if unregistered:
