@@ -74,8 +74,8 @@ class ModelConfig(_Table):
     ordered along, so that views turned away from the photos look right; 0: 3DGS; fisheyes and panoramas have none"""
     background: Literal["black", "random"] = "black"
     """what lies behind the Gaussians in training steps; black: 3DGS, whose surfaces may let some of it through; random:
-    a color drawn for each step, so that surfaces are opaque, for renders over other pictures. Rendered photos with
-    transparent parts, which count as black light, always have black"""
+    a color drawn for each step, so that surfaces are opaque, for renders over other pictures. Rendered sets whose
+    transparent parts count as black light always have black, except for sets of OpenEXR pictures"""
     dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     """share of the Gaussians that the last step leaves out at random, against overfitting to few photos (DropGaussian);
     it grows from 0"""

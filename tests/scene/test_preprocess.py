@@ -60,8 +60,9 @@ def test_a_lens_that_leaves_little_of_the_photos_is_named(tmp_path):
 
 def test_transparent_pixels_show_black_light(tmp_path):
     write_blender(tmp_path, rgba=True, camera_angle_x=0.7)
-    view = load(tmp_path, cache=tmp_path / "cache").views[0]
-    assert view.image[:, :20].max() == 0 and view.mask is None
+    scene = load(tmp_path, cache=tmp_path / "cache")
+    view = scene.views[0]
+    assert view.image[:, :20].max() == 0 and view.mask is None and scene.black_background
     note = "transparency: 6 of 6 photos have transparent pixels, which count as black light"
     assert note in load(tmp_path, cache=tmp_path / "cache").notes
     np.testing.assert_allclose(view.image[:, 20:], pattern(40, 30, 0)[:, 20:] / 255, atol=1e-6)
@@ -75,7 +76,7 @@ def test_alpha_keeps_pixels_out(tmp_path):
     scene = load(tmp_path)
     assert scene.views[1].mask[:12].max() == 0 and scene.views[1].mask[12:].min() == 1
     np.testing.assert_array_equal(scene.views[1].image, pattern(64, 48, 1).astype(np.float32) / np.float32(255))
-    assert scene.views[2].mask is None
+    assert scene.views[2].mask is None and not scene.black_background
     assert "transparency: 1 of 6 photos have transparent pixels, which are left out" in scene.notes
 
 
