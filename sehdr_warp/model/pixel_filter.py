@@ -170,7 +170,7 @@ class RayLimits(NamedTuple):
 
 
 WIDE_LIMITS = RayLimits(0.3, 0.3)
-"""Of pages, which draw no rays, of scenes that need_rays(): views of two rooms gain 3 to 6 dB."""
+"""Limits of pages, which draw no rays, for scenes that need_rays(): views of two rooms gain 3 to 6 dB."""
 
 
 def options_of_view(

@@ -80,8 +80,7 @@ class RadianceField(nn.Module):
             photo_focals: As in the attributes.
         """
         super().__init__()
-        self.photo_focals = photo_focals
-        self.normalization = normalization or Normalization()
+        self.photo_focals, self.normalization = photo_focals, normalization or Normalization()
         self.gaussians, self.fusion = gaussians, fusion
         self.response, self.base_time = response, base_time
         self.color_model, self.tone_map = make_color_model(color_model), tone_map
@@ -112,8 +111,8 @@ class RadianceField(nn.Module):
     def camera_tensors(self, camera: Camera) -> CameraTensors:
         """Return a camera of scene coordinates in those of the Gaussians, on their device."""
         require_camera(camera)
-        camera, device = self.normalization.camera(camera), self.gaussians.means.device
-        return CameraTensors.of(camera, device, along_rays=self.along_rays)
+        along_rays, device = self.along_rays, self.gaussians.means.device
+        return CameraTensors.of(self.normalization.camera(camera), device, along_rays=along_rays)
 
     def render_photo(
         self,
@@ -365,8 +364,9 @@ class RadianceField(nn.Module):
         if camera.directions is not None:
             return self._rasterize_wide(camera, camera.directions, shapes, features, opacities, at_place)
         lens = camera.world_to_camera, camera.intrinsics, camera.width, camera.height
+        arguments = means, view.log_scales, quaternions, opacities, features, *lens
         return self.rasterizer(  # rasterize(), see the class
-            *(*shapes, opacities, features, *lens),
+            *arguments,
             eps2d=view.eps2d,
             ray_limit_x=view.ray_limit_x,
             ray_limit_y=view.ray_limit_y,

@@ -78,17 +78,17 @@ def test_a_film_states_the_shape_of_its_pixels_and_rates_of_television(tmp_path,
 
 def test_cameras_of_other_sizes_and_shapes_keep_the_proportions_of_what_they_show(tmp_path, monkeypatch, caplog):
     run, cameras = smooth_run()
-    first, render, shown = cameras[0].resized(96, 64), run.render, []
+    first, render, calls = cameras[0].resized(96, 64), run.render, []
     smaller, upright = first.resized(72, 48), replace(first, width=40, height=60, fx=30.0, fy=30.0, cx=20.0, cy=30.0)
-    monkeypatch.setattr(run, "render", lambda camera: shown.append(camera) or render(camera))
+    monkeypatch.setattr(run, "render", lambda camera: calls.append(camera) or render(camera))
     film = {"transfer": "logc3", "overwrite": True}
     write_film(run, tmp_path / "f.mov", [first, smaller], **film)
-    assert shown[0].to_dict() == shown[1].to_dict() == first.to_dict() and not caplog.messages
+    assert calls[0].to_dict() == calls[1].to_dict() == first.to_dict() and not caplog.messages
     write_film(run, tmp_path / "f.mov", [first, smaller, upright], **film)
     problem = "1 of 3 cameras are not of the shape of the first, 96 x 64: their frames show more or less at the sides"
     assert caplog.messages == [f"{tmp_path / 'f.mov'}: {problem}"]
     wider = {"width": 96, "height": 64, "fx": 32.0, "fy": 32.0, "cx": 48.0, "cy": 32.0}
-    assert shown[-1].to_dict() == upright.to_dict() | wider and len(frames(tmp_path / "f.mov")[0]) == 3
+    assert calls[-1].to_dict() == upright.to_dict() | wider and len(frames(tmp_path / "f.mov")[0]) == 3
     panorama = replace(first, width=64, height=32, projection="equirectangular")
     with pytest.raises(SehdrError, match="size 96x64 would distort a panorama"):
         write_film(run, tmp_path / "g.mov", [first, panorama], **film)
