@@ -2,7 +2,7 @@
 
 import ipaddress
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,6 +17,13 @@ class Refusal(Exception):
         """Set the status and the line."""
         self.status = status
         super().__init__(line)
+
+
+def choice(request: dict, field: str, names: Sequence[str]) -> str:
+    """Return a field of a request that is one of some names; raise Refusal for any other value."""
+    if (value := request.get(field)) not in names:
+        raise Refusal(400, f"{field} {value!r:.40} is not one of {', '.join(names)}")
+    return value
 
 
 def own_path(path: str) -> str:

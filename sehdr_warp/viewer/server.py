@@ -29,7 +29,7 @@ from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
 from ..scene import Camera
-from .clients import ClientRun, Refusal, is_local, own_path
+from .clients import ClientRun, Refusal, choice, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, history_of, orient
 from .renderer import Renderer
@@ -196,7 +196,8 @@ class Viewer:
 
     def _save(self, request: dict, client: Connection) -> Answer:
         """Return what a client saves: EXR, a zip of what `render` writes, a film or a page."""
-        cameras, kind, stops = _cameras_of(request), str(request["kind"]), float(request.get("stops") or 0)
+        kind = choice(request, "kind", ("exr", "brackets", "film", "page"))
+        cameras, stops = _cameras_of(request), float(request.get("stops") or 0)
         run: Any = ClientRun(self.on_renderer, self._run_of(request), client)
         if not abs(stops) <= MOST_STOPS:  # NaN is not.
             raise Refusal(400, f"stops {stops} are not between -{MOST_STOPS:g} and {MOST_STOPS:g}")

@@ -150,6 +150,12 @@ def test_bad_questions_are_answered_in_a_line(serve, path, body, status):
     assert ask(server, "/scene")[0] == 200
 
 
+@pytest.mark.parametrize("kind", ["png", "EXR", "", None, 1, ["exr"], {}])
+def test_a_kind_that_is_not_saved_is_refused_with_those_that_are(serve, kind):
+    status, _, content = ask(serve(), "/save", {"cameras": [camera().to_dict()], "kind": kind})
+    assert (status, content.decode()) == (400, f"kind {kind!r} is not one of exr, brackets, film, page")
+
+
 def test_other_sites_may_not_ask(serve):
     server, good = serve(), {"camera": camera().to_dict()}
     port = server.server_address[1]
