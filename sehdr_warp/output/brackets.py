@@ -112,6 +112,7 @@ def write_brackets(
     Raises:
         SehdrError: For unusable exposures or options.
         InputError: If a file would be replaced or a pixel is not finite.
+        TypeError: For pictures that are not floats, such as a photo's codes.
     """
     writer = BracketWriter(
         out=Path(out),
@@ -206,12 +207,21 @@ class BracketWriter:
         names = dict.fromkeys(entry[kind] for kind in ("file", "ldr_file") for entry in entries if kind in entry)
         return [self.out / name for name in names]
 
-    def write(self, name: str, radiance: np.ndarray, camera: Camera | None) -> None:
+    def write(self, name: str, radiance: Any, camera: Camera | None) -> None:
         """Write the bracket of a view: its radiance, [H, W, 3] scene-linear Rec.709; `name` is safe for files.
 
         Simulated photos encode this radiance, so that merging them by the response gives it back.
+
+        Raises:
+            TypeError: For values that are not floats.
+            ValueError: For another shape.
         """
-        radiance = np.asarray(radiance, np.float64)
+        values = radiance.detach().cpu() if hasattr(radiance, "detach") else radiance  # A tensor, perhaps of a GPU
+        dtype = np.asarray(values).dtype
+        if dtype.kind != "f":
+            remedy = "pass radiance as floats, such as response.decode(codes / 255) / exposure_time of a photo's codes"
+            raise TypeError(f"views[{name!r:.90}] has dtype {dtype}, which is not radiance; {remedy}")
+        radiance = np.asarray(values, np.float64)
         if radiance.shape[2:] != (3,) or not radiance.size:
             raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
         check_finite(self.out / "brackets" / name, radiance, "{count} radiances")

@@ -1,8 +1,10 @@
 import json
+import re
 from fractions import Fraction
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from sehdr_warp.errors import InputError, SehdrError
@@ -160,6 +162,24 @@ def test_exif_times_are_simple_fractions():
     for time, expected in ((1 / 400, (1, 400)), (0.1, (1, 10)), (32.0, (32, 1)), (1 / 3, (1, 3)), (1e-6, (1, 10**6))):
         value = exposure_exif(time).get_ifd(EXIF_IFD)[EXPOSURE_TIME]
         assert (value.numerator, value.denominator) == expected
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64, bool, complex])
+def test_codes_are_not_taken_for_radiance(tmp_path, dtype):
+    codes = np.ones((3, 4, 3), dtype)
+    name = re.escape(f"views['a'] has dtype {codes.dtype}, which is not radiance; pass radiance as floats")
+    for views in ({"a": codes}, {"a": torch.from_numpy(codes)}):
+        with pytest.raises(TypeError, match=name):
+            write_brackets(tmp_path, views, 1, evs=[0])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_floats_of_any_width_and_tensors_are_radiance(tmp_path, dtype):
+    image = radiance().astype(dtype)
+    for place, view in (("array", image), ("tensor", torch.from_numpy(image)), ("list", image.tolist())):
+        [file] = write_brackets(tmp_path / place, {"a": view}, 1, evs=[0], pixel="float")
+        np.testing.assert_array_equal(read_exr(file)[0], image.astype(np.float32))
 
 
 def test_unusable_options(tmp_path):
