@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from ..errors import InputError, SehdrError
 from ..files import read_json, refuse_links, write_json
+from ..json_values import damage
 from ..response import Response
 from ..runs.config import REFERENCE_ITERATIONS, Config
 from ..runs.config_files import config_of_run, field_and_problem, override_config
@@ -360,7 +361,7 @@ def _cameras_of(values: Mapping[str, Any]) -> dict[str, Camera]:
     try:
         return {name: Camera.from_dict(camera) for name, camera in values.get("cameras", {}).items()}
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"cameras: one is damaged ({error!r:.200})") from None
+        raise ValueError(f"cameras: one is damaged ({damage(error)})") from None
 
 
 def _check_blocks(plan: BlockPlanValues) -> tuple[Block, ...]:

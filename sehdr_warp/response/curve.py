@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ..errors import SehdrError
+from ..json_values import damage
 
 HALF_CODE = 0.5 / 255  # An encoded value nearer to white than this is stored as 255
 # Rise of encode_extended beyond the clip point for each factor of e in exposure: a tenth of a gamma curve's just below
@@ -112,7 +113,7 @@ class Response(ABC):
         try:
             return Response._kinds[kind]._from_dict(values)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise SehdrError(f"response: the stored {kind} curve is damaged ({error!r:.200})") from error
+            raise SehdrError(f"response: the stored {kind} curve is damaged ({damage(error)})") from error
 
     def start_exposures(self, encoded: np.ndarray) -> np.ndarray:
         """Return exposures above 0 for Gaussians to start from, of encoded values in (0, 1); float64 of one shape."""

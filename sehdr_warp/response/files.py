@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import InputError, SehdrError, nearest
 from ..files import read_json, read_text
+from ..json_values import damage, numbers
 from ..sandbox import mat_arrays, read_sandboxed
 from .curve import Response
 from .table import ChannelResponse, TabulatedResponse
@@ -168,11 +169,11 @@ def _json_curve(path: Path) -> Response:
     try:
         if "kind" in fields:
             return Response.from_dict(fields)
-        exposures, values = (np.array(fields[key], np.float64) for key in ("exposures", "values"))
+        exposures, values = (numbers(fields, key, -1) for key in ("exposures", "values"))
     except SehdrError as error:
         raise InputError(path, str(error), remedy) from error
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(path, f"has no two lists of numbers ({error!r})", remedy) from error
+    except (KeyError, ValueError) as error:
+        raise InputError(path, f"has no two lists of numbers ({damage(error)})", remedy) from error
     return TabulatedResponse(str(fields.get("name", path.name)), exposures, values, source=str(path))
 
 

@@ -29,6 +29,7 @@ from pathlib import Path
 
 from ..errors import InputError, SehdrError
 from ..files import UnreadableError, has_file, refuse_links
+from ..json_values import damage
 from ..model.confidence import MAX_STOPS, Evidence
 from ..response import Response
 from ..scene import Camera, Scene
@@ -189,7 +190,7 @@ class RunFolder:
         try:
             return tuple(_camera_entry(view, self.scene_file) for view in views)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(self.scene_file, f"a view is damaged ({error!r:.200})", REMEDY) from None
+            raise InputError(self.scene_file, f"a view is damaged ({damage(error)})", REMEDY) from None
 
     def check_same_scene(self, scene: Scene) -> None:
         """Raise InputError if the run was trained on other views, cameras or photos than a scene's."""

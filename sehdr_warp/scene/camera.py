@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..json_values import json_object, number, numbers, text, whole_number
+
 FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """COLMAP's fisheye models that are radial."""
 PROJECTIONS = ("pinhole", "equirectangular", *FISHEYES)
 MAX_SIDE = 1 << 20  # Pixels of a side of an image that can be rendered
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # Pixels of a focal length; beyond them single precision cannot project
 MAX_DISTANCE = 1e18  # Length of the translation of a pose, whose square a float32 must hold
-_WHOLE = 1 << 53  # Largest number up to which a float of JSON holds every whole number
 
 
 def limited_size(width: int, height: int, max_size: int | None) -> tuple[int, int]:
@@ -34,13 +35,6 @@ def look_at(position: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0), up: ArrayL
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ position
     return pose
-
-
-def whole_number(value: Any, name: str) -> int:
-    """Return a number of JSON that is whole; raise ValueError, naming the field, for any other value."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not -_WHOLE <= value <= _WHOLE or value % 1:
-        raise ValueError(f"{name} = {value!r:.40} is not a whole number")
-    return int(value)
 
 
 class ProjectedPoints(NamedTuple):
@@ -117,7 +111,9 @@ class Camera:
         if np.abs(pose[:3, 3]).max() > MAX_DISTANCE:
             raise ValueError(f"world_to_camera moves by more than {MAX_DISTANCE:g}")
         rotation = pose[:3, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+        if np.abs(rotation).max() > 2 or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+            raise ValueError("the rotation of world_to_camera is not a proper rotation")
+        if np.linalg.det(rotation) < 0:
             raise ValueError("the rotation of world_to_camera is not a proper rotation")
         if not np.allclose(pose[3], (0, 0, 0, 1)):
             raise ValueError("the last row of world_to_camera is not (0, 0, 0, 1)")
@@ -194,13 +190,14 @@ class Camera:
 
         Raises:
             KeyError: if a field is missing.
-            ValueError: if a value is not possible.
+            ValueError: if a value is not possible, or the values are not an object.
         """
-        width, height = (whole_number(values[name], name) for name in ("width", "height"))
-        fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
-        pose = np.array(values["world_to_camera"], dtype=np.float64)
-        distortion = tuple(float(value) for value in values.get("distortion", ()))
-        return Camera(width, height, fx, fy, cx, cy, pose, str(values.get("projection", "pinhole")), distortion)
+        values = json_object(values, "the camera")
+        width, height = (whole_number(values, name) for name in ("width", "height"))
+        fx, fy, cx, cy = (number(values, name) for name in ("fx", "fy", "cx", "cy"))
+        pose = numbers(values, "world_to_camera", 4, 4)
+        distortion = tuple(numbers(values, "distortion", -1).tolist()) if "distortion" in values else ()
+        return Camera(width, height, fx, fy, cx, cy, pose, text(values, "projection", "pinhole"), distortion)
 
 
 def require_camera(camera: object) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
+from ..json_values import damage
 from .arrays import HARMONIC_0, GaussianArrays, degree_of, join_gaussians, read_facts, stated_facts
 
 log = logging.getLogger(__name__)
@@ -98,7 +99,7 @@ def read_glb(path: Path) -> GaussianArrays:
                         raise InputError(path, problem, "export each Gaussian once")
                     parts.append(gaussians if np.allclose(matrix, np.eye(4)) else _move(gaussians, matrix, path))
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise InputError(path, f"is damaged glTF ({error!r:.120})", _DAMAGED) from None
+        raise InputError(path, f"is damaged glTF ({damage(error)})", _DAMAGED) from None
     if not parts:
         raise InputError(path, f"has no primitive with {EXTENSION}", "export Gaussians by the ratified extension")
     return join_gaussians(parts)

@@ -21,6 +21,7 @@ from PIL import Image
 from .. import __version__
 from ..errors import InputError
 from ..files import atomic_path, read_bytes
+from ..json_values import damage
 from .arrays import GaussianArrays, read_facts, stated_facts
 from .packing import CODES, codebook, from_smallest_three, logits, morton_order, palette, smallest_three
 
@@ -148,7 +149,7 @@ def refusing_damage(path: Path) -> Iterator[None]:
         with np.errstate(over="ignore", invalid="ignore"):  # Values that are not finite are left out and counted later.
             yield
     except (zipfile.BadZipFile, zlib.error, RecursionError, Image.DecompressionBombError, *_FAULTS) as error:
-        raise InputError(path, f"is damaged SOG ({error!r:.120})", _DAMAGED) from None
+        raise InputError(path, f"is damaged SOG ({damage(error)})", _DAMAGED) from None
 
 
 def gaussians_of_files(read: Callable[[str, int], bytes], path: Path) -> GaussianArrays:

@@ -15,6 +15,7 @@ VALUES = (
     float("nan"), float("inf"), float("-inf"), "", "x", "nan", "1", "../x", "/etc/passwd", "a\0b", "\ud800", "é" * 3000,
     [], {}, [[]], [0], [None], {"a": 1}, [1, 2, 3], [[1.0] * 4] * 4,
 )  # fmt: skip
+SHAPES = (None, True, 0, 1.5, "x", [], [1, 2], [[1, 2], [3]], {}, {"a": 1})
 WORDS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
 REALS = (0.0, -0.0, float("nan"), float("inf"), float("-inf"), 1e308, -1e308, 5e-324, 1e-30, 1e30)
 _TOKEN = re.compile(rb"[-+.\w]+")
@@ -33,6 +34,24 @@ def mutate(data: bytes, others: list[bytes], text: bool, rng: random.Random) -> 
         else:
             data = rng.choice(kinds)(data, rng)
     return data
+
+
+def misshapen(data: bytes) -> list[bytes]:
+    """Every file that differs from a JSON file in one value, which is missing or of another shape."""
+    files = []
+
+    def change(node, rebuild):
+        files.extend(json.dumps(rebuild(shape)).encode() for shape in SHAPES)
+        if isinstance(node, dict):
+            for key in node:
+                files.append(json.dumps(rebuild({name: value for name, value in node.items() if name != key})).encode())
+                change(node[key], lambda value, key=key: rebuild(node | {key: value}))
+        elif isinstance(node, list):
+            for place in range(min(len(node), 2)):
+                change(node[place], lambda value, at=place: rebuild([*node[:at], value, *node[at + 1 :]]))
+
+    change(json.loads(data), lambda value: value)
+    return files
 
 
 def _place(data: bytes, rng: random.Random) -> int:

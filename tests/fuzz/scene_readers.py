@@ -15,12 +15,14 @@ from sehdr_warp.scene.readers.colmap import read_colmap
 from sehdr_warp.scene.readers.colmap_model import read_ply_points
 from sehdr_warp.scene.readers.hdr_sets import read_hdr_nerf, read_hdr_nerf_real
 from sehdr_warp.scene.readers.llff import read_llff
+from sehdr_warp.scene.readers.meshroom import read_meshroom
 from sehdr_warp.scene.readers.opensfm import read_opensfm
 from sehdr_warp.scene.readers.transforms import read_transforms
 from sehdr_warp.synth.expose import RadianceView
 from tests.make_scenes import pattern, write_blender, write_colmap, write_llff, write_reinhard
 from tests.output.helpers import camera
 from tests.scene.readers.test_arkit import write as write_scan
+from tests.scene.readers.test_meshroom import write as write_meshroom
 from tests.training.toy import orbit_camera
 
 from .reader import Reader, each
@@ -106,6 +108,10 @@ def make_scan(folder: Path) -> None:
     write_scan(folder, "scanner")
 
 
+def make_meshroom(folder: Path) -> None:
+    write_meshroom(folder)
+
+
 def make_chan(folder: Path) -> None:
     (folder / "own.chan").write_text("".join(f"{n} 0.5 1.5 {n}.0 10 20 30 45.5\n" for n in range(1, 5)))
 
@@ -123,6 +129,7 @@ READERS = {
     "cameras": Reader(make_cameras, ("*.json",), each(load_cameras), text=True, cost=0.5),
     "cameras-of-others": Reader(make_cameras_of_others, ("*.json",), each(load_cameras), text=True, cost=0.7),
     "opensfm": Reader(make_opensfm, ("reconstruction.json",), read_opensfm, text=True, cost=0.9),
+    "meshroom": Reader(make_meshroom, ("cameras.sfm",), read_meshroom, text=True, cost=1),
     "scan": Reader(make_scan, ("*.json",), read_scan, text=True, cost=1),
     "chan": Reader(make_chan, ("*",), each(load_cameras), text=True, cost=1.4),
 }

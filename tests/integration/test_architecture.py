@@ -16,13 +16,13 @@ PACKAGE = ROOT / "sehdr_warp"
 # them all what any package may use.
 ANY = {
     "errors", "quiet", "arguments", "files", "own_files", "console", "sandbox", "parallel", "limits", "caches",
-    "progress", "subsets",
+    "progress", "subsets", "json_values",
 }  # fmt: skip
 ALLOWED = {
-    **{name: set() for name in ("kernels", "errors", "quiet", "limits", "progress", "caches")},
+    **{name: set() for name in ("kernels", "errors", "quiet", "limits", "progress", "caches", "json_values")},
     "sandbox": {"errors"},
     "parallel": {"limits"},
-    "files": {"errors", "own_files"},
+    "files": {"errors", "own_files", "json_values"},
     "own_files": {"errors"},
     "arguments": {"errors"},
     "splats": ANY,

@@ -67,11 +67,11 @@ RUNS = {
     "scene.json gone": (lambda run: (run / "scene.json").unlink(), CHANGED),
     "camera NaN": (
         lambda run: edit_view(run, fx=float("nan")),
-        "scene.json: a view is damaged (ValueError('camera fx, fy, cx, cy = [nan,",
+        "scene.json: a view is damaged (camera fx, fy, cx, cy = [nan,",
     ),
     "camera huge": (
         lambda run: edit_view(run, width=10**9, height=10**9),
-        "scene.json: a view is damaged (ValueError('image size 1000000000 x 1000000000",
+        "scene.json: a view is damaged (image size 1000000000 x 1000000000",
     ),
     "exposure zero": (
         lambda run: edit_view(run, exposure_time=0),

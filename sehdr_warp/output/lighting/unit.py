@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import InputError, SehdrError, refuse_paths
 from ...files import read_json, write_json
+from ...json_values import damage, number, numbers, text
 from ...runs.values import LIGHT_UNIT_FILE
 from ..cameras.scene_cameras import find_view
 from ..images.tonemap import LUMINANCE
@@ -53,11 +54,13 @@ def read_light_unit(run: "RenderableScene") -> LightUnit | None:
         return None
     values = read_json(path)
     try:
-        x, y = (float(value) for value in values["pixel"])
-        unit = LightUnit(_check(values["luminance"]), str(values["view"]), (x, y), str(values["reading"]))
-    except (SehdrError, LookupError, OverflowError, TypeError, ValueError) as error:
+        x, y = numbers(values, "pixel", 2).tolist()
+        luminance = _check(number(values, "luminance"))
+        unit = LightUnit(luminance, text(values, "view"), (x, y), text(values, "reading"))
+    except (SehdrError, KeyError, ValueError) as error:
         remedy = "delete the file, or take the reading again with `sehdr-warp meter`"
-        raise InputError(path, f"cannot be used ({error})", remedy) from None
+        problem = str(error) if isinstance(error, SehdrError) else damage(error)
+        raise InputError(path, f"cannot be used ({problem})", remedy) from None
     return unit
 
 

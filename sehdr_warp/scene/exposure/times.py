@@ -10,6 +10,7 @@ from statistics import median
 
 from ...errors import InputError
 from ...files import has_file, read_bytes
+from ...json_values import damage, json_object, shown, text
 from ...subsets import counted, first_names
 from ..dataparser import ImageRecord
 from ..file_names import lies_at, plain_path
@@ -139,7 +140,7 @@ def parse_seconds(value, source: Path, field: str, unit: str = "") -> float:
     seconds = parse_number(f"{value}{unit}")
     if isinstance(value, bool) or seconds is None or not SHORTEST <= seconds <= LONGEST:
         remedy = 'state seconds above zero, such as 0.008 or "1/125"'
-        raise InputError(source, f"exposure time of {field!r:.90} is {value!r:.40}", remedy)
+        raise InputError(source, f"exposure time of {field!r:.90} is {shown(value)}", remedy)
     return seconds
 
 
@@ -196,10 +197,11 @@ def _read_times(path: Path) -> Mapping[str, float]:
     try:
         values = json.loads(read_bytes(path, 1 << 24))
         if isinstance(values, list):
-            values = {entry["file"]: entry["exposure_time"] for entry in values}
-        entries = values.items()
-    except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
-        problem = f"is not a table of exposure times ({error!r:.80})"
+            listed = [json_object(entry, f"entry {place}") for place, entry in enumerate(values)]
+            values = {text(entry, "file"): entry["exposure_time"] for entry in listed}
+        entries = json_object(values, "it").items()
+    except (ValueError, RecursionError, KeyError) as error:
+        problem = f"is not a table of exposure times ({damage(error)})"
         raise InputError(path, problem, 'write {"file name": seconds, ...}') from None
     return {str(name): parse_seconds(value, path, str(name)) for name, value in entries}
 

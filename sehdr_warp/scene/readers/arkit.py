@@ -13,6 +13,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import read_json
+from ...json_values import damage, number, numbers
 from ..dataparser import DataparserOutputs, ImageRecord
 from ..file_names import find_image, list_images, natural_key
 from ..images.ldr_files import LDR_SUFFIXES, PHOTO_SUFFIXES
@@ -87,13 +88,14 @@ def _record(image: Path, file: Path) -> ImageRecord:
     values = read_json(file)
     try:
         if "t_00" in values:
-            numbers, lens = [values[key] for key in _POLYCAM], [values[key] for key in ("fx", "fy", "cx", "cy")]
-            width, height = int(values["width"]), int(values["height"])
+            matrix = np.reshape([number(values, key) for key in _POLYCAM], (3, 4))
+            params = tuple(number(values, key) for key in ("fx", "fy", "cx", "cy"))
+            width, height = int(number(values, "width")), int(number(values, "height"))
         else:
-            numbers, (fx, _, cx, _, fy, cy) = values["cameraPoseARFrame"], values["intrinsics"][:6]
-            lens, (width, height) = (fx, fy, cx, cy), photo_sizes(image)[0]
-        matrix, params = np.array(numbers, np.float64).reshape(-1, 4), tuple(float(number) for number in lens)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(file, f"states no usable pose and lens ({error!r:.60})", _REMEDY) from None
+            matrix = numbers(values, "cameraPoseARFrame", -1, 4)
+            (fx, _, cx), (_, fy, cy), *_ = numbers(values, "intrinsics", -1, 3).tolist()
+            params, (width, height) = (fx, fy, cx, cy), photo_sizes(image)[0]
+    except (KeyError, ValueError, OverflowError) as error:
+        raise InputError(file, f"states no usable pose and lens ({damage(error)})", _REMEDY) from None
     pose = pose_from_opengl(matrix, file, image.name)
     return ImageRecord(image.stem, image, Lens("PINHOLE", width, height, params, file), pose)

@@ -10,7 +10,8 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import read_json, read_text
-from ..camera import Camera, whole_number
+from ...json_values import damage, number, numbers, shown, text, whole_number
+from ..camera import Camera
 from ..dataparser import pose_from_camera_to_world
 from ..file_names import natural_key
 from ..images.ldr_files import MAX_PIXELS
@@ -75,15 +76,15 @@ def read_camera_file(path: Path) -> ExchangeCameras:
 
 
 def _of_json(path: Path) -> list[tuple[str, Camera]]:
-    if (text := read_text(path)).lstrip().startswith("["):
+    if (content := read_text(path)).lstrip().startswith("["):
         try:
-            entries = json.loads(text)
+            entries = json.loads(content)
         except (ValueError, RecursionError) as error:
             raise InputError(path, f"is not valid JSON ({error})", "export the file again") from None
-        return _cameras(path, entries, lambda entry, _: (str(entry["img_name"]), _inria(entry, path)))
+        return _cameras(path, entries, lambda entry, _: (text(entry, "img_name"), _inria(entry, path)))
     values = read_json(path)
     if isinstance(values.get("cameras"), list):
-        return _cameras(path, values["cameras"], lambda e, i: (str(e.get("name", f"{i:04d}")), Camera.from_dict(e)))
+        return _cameras(path, values["cameras"], lambda e, i: (text(e, "name", f"{i:04d}"), Camera.from_dict(e)))
     if isinstance(values.get("camera_path"), list):
         back = _dataparser(path)
         return _cameras(path, values["camera_path"], lambda e, i: (f"{i:04d}", _nerfstudio(e, i, values, path, back)))
@@ -99,11 +100,14 @@ def _cameras(path: Path, entries: list, read) -> list[tuple[str, Camera]]:
     """Call read(entry, index) for each entry, with errors that name the camera."""
     cameras = []
     for i, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            problem = f"camera {i} is {shown(entry)}, not an object"
+            raise InputError(path, problem, "state its size, focal lengths and pose by name, or give another file")
         try:
             cameras.append(read(entry, i))
         except KeyError as error:
             raise InputError(path, f"camera {i} has no {error.args[0]}", "add the field") from None
-        except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError) as error:
+        except (ValueError, OverflowError, ZeroDivisionError) as error:
             raise InputError(path, f"camera {i} cannot be used ({error!s:.120})", "correct the camera") from None
     return cameras
 
@@ -113,26 +117,26 @@ def _inria(entry: dict, path: Path) -> Camera:
 
     The reference release states no cx and cy, as its axes are centered; export writes those that are not.
     """
-    width, height = (whole_number(entry[name], name) for name in ("width", "height"))
-    matrix = np.c_[np.array(entry["rotation"], np.float64).reshape(3, 3), np.array(entry["position"], np.float64)]
-    pose = pose_from_camera_to_world(matrix, path, str(entry["img_name"]))
-    cx, cy = float(entry.get("cx", width / 2)), float(entry.get("cy", height / 2))
-    return Camera(width, height, float(entry["fx"]), float(entry["fy"]), cx, cy, pose)
+    width, height = (whole_number(entry, name) for name in ("width", "height"))
+    matrix = np.c_[numbers(entry, "rotation", 3, 3), numbers(entry, "position", 3)]
+    pose = pose_from_camera_to_world(matrix, path, text(entry, "img_name"))
+    cx, cy = number(entry, "cx", width / 2), number(entry, "cy", height / 2)
+    return Camera(width, height, number(entry, "fx"), number(entry, "fy"), cx, cy, pose)
 
 
 def _nerfstudio(entry, index: int, values: dict, path: Path, back: np.ndarray | None) -> Camera:
     """Read an entry of camera_path.json: camera_to_world (OpenGL axes, 16 numbers by rows), fov (vertical, degrees)."""
-    width, height = (whole_number(values[name], name) for name in ("render_width", "render_height"))
+    width, height = (whole_number(values, name) for name in ("render_width", "render_height"))
     kind = entry.get("camera_type", values.get("camera_type", "perspective"))
     if kind != "perspective":
         raise InputError(path, f"camera {index} has camera_type {kind!r:.40}", "use perspective cameras")
-    fov = float(entry["fov"])
-    matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
+    fov, matrix = number(entry, "fov"), numbers(entry, "camera_to_world", 4, 4)
     if not 1e-6 <= fov < 180:
         raise InputError(path, f"camera {index} has fov {fov}", "use degrees between 0 and 180")
     if back is not None:
-        matrix = back @ matrix
-        matrix[:3, :3] /= np.cbrt(np.linalg.det(matrix[:3, :3]))
+        with np.errstate(all="ignore"):  # What is not finite is refused below.
+            matrix = back @ matrix
+            matrix[:3, :3] /= np.cbrt(np.linalg.det(matrix[:3, :3]))
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     pose = pose_from_opengl(matrix, path, f"camera {index}")
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)
@@ -146,10 +150,10 @@ def _dataparser(path: Path) -> np.ndarray | None:
         return None
     values = read_json(beside)
     try:
-        matrix, scale = np.array(values["transform"], np.float64).reshape(3, 4), float(values["scale"])
+        matrix, scale = numbers(values, "transform", 3, 4), number(values, "scale")
         return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ np.r_[matrix, [[0, 0, 0, 1]]])
-    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
-        problem = f"has no usable transform and scale ({error!r:.80})"
+    except (KeyError, ValueError, np.linalg.LinAlgError) as error:
+        problem = f"has no usable transform and scale ({damage(error)})"
         raise InputError(beside, problem, "copy nerfstudio's file of the training") from None
 
 

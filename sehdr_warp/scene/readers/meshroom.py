@@ -8,6 +8,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import read_json
+from ...json_values import damage, json_list, json_object, number, numbers, text
 from ..dataparser import DataparserOutputs, ImageRecord, pose_from_camera_to_world
 from ..file_names import find_images, natural_key
 from ..lens import Lens
@@ -15,6 +16,7 @@ from ..photos import unusable_notes
 from .transforms import absent_note
 
 _PLACES = ("*.sfm", "sfm*.json", "MeshroomCache/StructureFromMotion/*/cameras.sfm")
+_LISTS = ("views", "path"), ("poses", "poseId"), ("intrinsics", "intrinsicId")
 _REMEDY = "compute the node StructureFromMotion again, or export for COLMAP"
 
 
@@ -43,13 +45,12 @@ def read_meshroom(folder: Path) -> DataparserOutputs:
     path = find_sfm(folder) or folder / "cameras.sfm"
     values = read_json(path)
     try:
-        version = tuple(int(number) for number in values["version"])
-        views = {str(view["path"]): dict(view) for view in values["views"]}
-        poses = {str(pose["poseId"]): pose["pose"]["transform"] for pose in values["poses"]}
-        lenses = {str(lens["intrinsicId"]): dict(lens) for lens in values["intrinsics"]}
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(path, f"is not a file of Meshroom with poses ({error!r:.60})", _REMEDY) from None
-    names = [name for name in sorted(views, key=natural_key) if str(views[name].get("poseId")) in poses]
+        version = tuple(int(part) for part in numbers(values, "version", -1))
+        views, poses, lenses = (_by_name(values, *names) for names in _LISTS)
+        transforms = {name: json_object(pose["pose"], "pose")["transform"] for name, pose in poses.items()}
+    except (KeyError, ValueError, OverflowError) as error:
+        raise InputError(path, f"is not a file of Meshroom with poses ({damage(error)})", _REMEDY) from None
+    names = [name for name in sorted(views, key=natural_key) if str(views[name].get("poseId")) in transforms]
     images = find_images(folder, names, path)
     if not any(images.values()):
         problem = f"none of the {len(names)} photos with a pose in {path.name} is here"
@@ -62,7 +63,7 @@ def read_meshroom(folder: Path) -> DataparserOutputs:
                 absent.append(plain)
                 continue
             lens = _lens(lenses.get(str(view.get("intrinsicId")), {}), version, path, plain)
-            pose = _pose(poses[str(view["poseId"])], view, path, plain)
+            pose = _pose(transforms[str(view["poseId"])], view, path, plain)
             # AliceVision reads pixels as they are stored, whatever their EXIF orientation says.
             records.append(ImageRecord(image.stem, image, lens, pose))
         except InputError as error:
@@ -73,35 +74,43 @@ def read_meshroom(folder: Path) -> DataparserOutputs:
     return DataparserOutputs("meshroom", tuple(records), notes=tuple(notes), mentioned=tuple(unplaced))
 
 
+def _by_name(values: dict[str, Any], name: str, key: str) -> dict[str, dict[str, Any]]:
+    """Return the objects of a list by one of their fields; raise ValueError or KeyError for what is not such a list."""
+    objects = [json_object(each, f"one of {name}") for each in json_list(values[name], name)]
+    return {text(each, key): each for each in objects}
+
+
 def _pose(transform: Any, view: dict, path: Path, name: str) -> np.ndarray:
     """Return [4, 4] world_to_camera in OpenCV's axes; the file has its rotation column by column."""
     try:
         if view.get("rigId", "4294967295") != "4294967295":
             raise ValueError("cameras of rigs are not read")
         # The columns of a rotation are the rows of its inverse.
-        inverse = np.array(transform["rotation"], np.float64).reshape(3, 3)
-        matrix = np.c_[inverse, np.array(transform["center"], np.float64).reshape(3)]
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(path, f"pose of {name!r:.90} cannot be used ({error!s:.40})", _REMEDY) from None
+        inverse = numbers(json_object(transform, "transform"), "rotation", 3, 3)
+        matrix = np.c_[inverse, numbers(transform, "center", 3)]
+    except (KeyError, ValueError) as error:
+        raise InputError(path, f"pose of {name!r:.90} cannot be used ({damage(error)})", _REMEDY) from None
     return pose_from_camera_to_world(matrix, path, name)
 
 
 def _lens(values: dict, version: tuple[int, ...], path: Path, name: str) -> Lens:
     """Return a lens. Versions differ in the focal length, its aspect and the origin of the principal point."""
     try:
-        width, height = int(values["width"]), int(values["height"])
+        width, height = int(number(values, "width")), int(number(values, "height"))
         if version < (1, 2, 2):
-            fx, fy = np.broadcast_to(np.array(values["pxFocalLength"], np.float64), 2).tolist()
+            one = not isinstance(values["pxFocalLength"], list)
+            fx, fy = [number(values, "pxFocalLength")] * 2 if one else numbers(values, "pxFocalLength", 2).tolist()
         else:
-            fx = float(values["focalLength"]) / float(values["sensorWidth"]) * width
-            fy = fx * float(values.get("pixelRatio", 1)) ** (1 if version >= (1, 2, 5) else -1)
-        cx, cy = (float(number) for number in values["principalPoint"])
+            fx = number(values, "focalLength") / number(values, "sensorWidth") * width
+            fy = fx * number(values, "pixelRatio", 1) ** (1 if version >= (1, 2, 5) else -1)
+        cx, cy = numbers(values, "principalPoint", 2).tolist()
         if version >= (1, 2, 1):
             cx, cy = cx + width / 2, cy + height / 2
         kind = values["type"] if values["type"] != "pinhole" else values.get("distortionType", "none")
-        k1, k2, k3, k4, k5 = [*map(float, values.get("distortionParams") or ()), 0.0, 0.0, 0.0, 0.0, 0.0][:5]
-    except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-        raise InputError(path, f"lens of {name!r:.90} cannot be used ({error!r:.60})", _REMEDY) from None
+        bent = numbers(values, "distortionParams", -1).tolist() if values.get("distortionParams") else []
+        k1, k2, k3, k4, k5 = [*bent, 0.0, 0.0, 0.0, 0.0, 0.0][:5]
+    except (KeyError, ValueError, OverflowError, ZeroDivisionError) as error:
+        raise InputError(path, f"lens of {name!r:.90} cannot be used ({damage(error)})", _REMEDY) from None
     if kind in ("fisheye4", "fisheye"):
         return Lens("OPENCV_FISHEYE", width, height, (fx, fy, cx, cy, k1, k2, k3, k4), path)
     if kind not in ("none", "radial1", "radialk1", "radial3", "radialk3", "brown"):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import read_text
+from ...json_values import damage, json_list, json_object, number, numbers, text
 from ...subsets import counted
 from ..dataparser import NO_POINTS, DataparserOutputs, ImageRecord, PointCloud
 from ..file_names import find_image, natural_key
@@ -36,13 +37,14 @@ def read_opensfm(folder: Path) -> DataparserOutputs:
         (place / "images" for place in (path.parent, folder) if (place / "images").is_dir()), folder / "images"
     )
     try:
-        models = json.loads(read_text(path))
+        models = json_list(json.loads(read_text(path)), "it")
         if models == []:
             raise InputError(path, "holds no reconstruction", "reconstruct again: OpenSfM placed no image")
-        model = max(models, key=lambda each: len(each["shots"]))
-        shots, cameras = dict(model["shots"]), dict(model["cameras"])
-    except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(path, f"is not a list of reconstructions ({error!r:.60})", _REMEDY) from None
+        models = [json_object(each, f"reconstruction {place}") for place, each in enumerate(models)]
+        model = max(models, key=lambda each: len(json_object(each["shots"], "shots")))
+        shots, cameras = model["shots"], json_object(model["cameras"], "cameras")
+    except (ValueError, RecursionError, KeyError) as error:
+        raise InputError(path, f"is not a list of reconstructions ({damage(error)})", _REMEDY) from None
     lenses = {name: _lens(values, path, name) for name, values in cameras.items()}
     records, absent, unusable = [], [], []
     for name in sorted(shots, key=natural_key):
@@ -79,11 +81,11 @@ def _pose(shot: dict, path: Path, name: str) -> np.ndarray:
 
     pose = np.eye(4)
     try:
-        turn, move = (np.array(shot[key], np.float64).reshape(3) for key in ("rotation", "translation"))
+        turn, move = (numbers(shot, key, 3) for key in ("rotation", "translation"))
         if not (np.isfinite(turn).all() and np.isfinite(move).all()):
             raise ValueError("not finite")
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(path, f"pose of {name!r:.90} cannot be used ({error!s:.40})", _REMEDY) from None
+    except (KeyError, ValueError) as error:
+        raise InputError(path, f"pose of {name!r:.90} cannot be used ({damage(error)})", _REMEDY) from None
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), move
     return pose
 
@@ -91,19 +93,16 @@ def _pose(shot: dict, path: Path, name: str) -> np.ndarray:
 def _lens(values: Any, path: Path, name: str) -> Lens:
     """Return a camera's lens. OpenSfM's lengths are parts of the longer side, its center is the picture's."""
     try:
-        kind = str(values["projection_type"]).lower()
-        width, height = int(values["width"]), int(values["height"])
+        values = json_object(values, "it")
+        kind = text(values, "projection_type").lower()
+        width, height = int(number(values, "width")), int(number(values, "height"))
         side = max(width, height)
-
-        def number(key: str, default: float = 0.0) -> float:
-            return float(values.get(key, default))
-
-        focal = number("focal", number("focal_x"))
-        fx, fy = number("focal_x", focal) * side, number("focal_y", focal) * side
-        cx, cy = width / 2 + number("c_x") * side, height / 2 + number("c_y") * side
-        k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise InputError(path, f"camera {name!r:.60} cannot be used ({error!r:.60})", _REMEDY) from None
+        focal = number(values, "focal", number(values, "focal_x", 0.0))
+        fx, fy = (number(values, key, focal) * side for key in ("focal_x", "focal_y"))
+        cx, cy = (middle / 2 + number(values, key, 0.0) * side for middle, key in ((width, "c_x"), (height, "c_y")))
+        k1, k2, k3, k4, p1, p2 = (number(values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    except (KeyError, ValueError, OverflowError) as error:
+        raise InputError(path, f"camera {name!r:.60} cannot be used ({damage(error)})", _REMEDY) from None
     lenses = {
         "perspective": ("RADIAL", (fx, cx, cy, k1, k2)),
         "simple_radial": ("OPENCV", (fx, fy, cx, cy, k1, 0.0, 0.0, 0.0)),
@@ -125,10 +124,11 @@ def _points(model: dict, path: Path) -> PointCloud:
     if not points:
         return NO_POINTS
     try:
-        positions = np.array([point["coordinates"] for point in points.values()], np.float64).reshape(-1, 3)
-        colors = np.array([point.get("color", (128, 128, 128)) for point in points.values()], np.float64).reshape(-1, 3)
+        listed = [json_object(point, f"point {place}") for place, point in json_object(points, "points").items()]
+        positions = np.array([point["coordinates"] for point in listed], np.float64).reshape(-1, 3)
+        colors = np.array([point.get("color", (128, 128, 128)) for point in listed], np.float64).reshape(-1, 3)
         if not (np.isfinite(positions).all() and np.isfinite(colors).all()):
             raise ValueError("not finite")
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise InputError(path, f"its points cannot be used ({error!r:.60})", _REMEDY) from None
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(path, f"its points cannot be used ({damage(error)})", _REMEDY) from None
     return PointCloud(positions, np.clip(colors / 255, 0, 1).astype(np.float32))

@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import re
 
 import numpy as np
 import pytest
@@ -137,9 +138,22 @@ HUGE = f'{{"luminance": 1, "view": "a", "pixel": [1{"0" * 400}, 2], "reading": "
 
 
 @pytest.mark.parametrize(
-    "text", ["{}", '{"luminance": 0, "view": "a", "pixel": [1, 2], "reading": "x"}', HUGE, "[1]", "{"]
+    "text, words",
+    [
+        ("{}", "cannot be used (pixel is missing)"),
+        (
+            '{"luminance": 0, "view": "a", "pixel": [1, 2], "reading": "x"}',
+            "cannot be used (luminance 0.0 is not between",
+        ),
+        ('{"luminance": null, "view": "a", "pixel": [1, 2], "reading": "x"}', "(luminance is null, not a number)"),
+        ('{"luminance": 1, "view": "a", "pixel": [1], "reading": "x"}', "(pixel holds 1 numbers, not 2 numbers)"),
+        ('{"luminance": 1, "view": [], "pixel": [1, 2], "reading": "x"}', "(view is a list of 0, not a text)"),
+        (HUGE, "pixel is a list of 2, not 2 numbers"),
+        ("[1]", "holds a list of 1, not an object"),
+        ("{", "is not valid JSON"),
+    ],
 )
-def test_a_damaged_file_is_named(run, text):
+def test_a_damaged_file_is_named(run, text, words):
     (run.path / LIGHT_UNIT_FILE).write_text(text)
-    with pytest.raises(InputError, match=LIGHT_UNIT_FILE):
+    with pytest.raises(InputError, match=f"{LIGHT_UNIT_FILE}: .*{re.escape(words)}"):
         read_light_unit(run)

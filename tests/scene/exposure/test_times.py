@@ -1,7 +1,6 @@
 """Exposure times: units, sets that differ in ISO alone, and times that EXIF contradicts."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 
@@ -154,9 +153,10 @@ def test_one_photo_without_time_does_not_stop_a_set_and_a_list_helps(tmp_path):
     assert {view.exposure_time for view in load(tmp_path).views} == {2.0}
     (tmp_path / "exposures.json").write_text(json.dumps({f"{i:03d}.jpg": "1/125" for i in range(6)}))
     assert {view.exposure_time for view in load(tmp_path).views} == {0.008}
-    for wrong in (0, -1, "1/0", "1/60 x", "/2", "soon", True, None, [1]):
+    for wrong, words in ((0, 0), (-1, -1), ("1/0", "'1/0'"), ("/2", "'/2'"), ("soon", "'soon'"), (True, "true"),
+                         (None, "null"), ([1], "a list of 1")):  # fmt: skip
         (tmp_path / "exposures.json").write_text(json.dumps([{"file": "000.jpg", "exposure_time": wrong}]))
-        with pytest.raises(InputError, match=rf"time of .000.jpg. is {re.escape(repr(wrong))}"):
+        with pytest.raises(InputError, match=rf"time of .000.jpg. is {words};"):
             load(tmp_path)
     for wrong in ("", "{", "3", "[" * 100_000, '{"000.jpg": NaN}', '{"000.jpg": 1e999}'):
         (tmp_path / "exposures.json").write_text(wrong)
