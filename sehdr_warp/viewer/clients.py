@@ -6,8 +6,13 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+from ..json_values import json_list, shown, whole_number
+from ..output.cameras.paths import interpolate
+from ..scene import Camera
 from .connections import Connection
-from .viewer_scene import ViewerScene
+from .viewer_scene import ViewerScene, camera_of
+
+MOST_VIEWS = 2000  # Cameras of a request
 
 
 class Refusal(Exception):
@@ -21,9 +26,29 @@ class Refusal(Exception):
 
 def choice(request: dict, field: str, names: Sequence[str]) -> str:
     """Return a field of a request that is one of some names; raise Refusal for any other value."""
-    if (value := request.get(field)) not in names:
-        raise Refusal(400, f"{field} {value!r:.40} is not one of {', '.join(names)}")
-    return value
+    value = request.get(field)
+    if value not in names:
+        raise Refusal(400, f"{field} is {shown(value)}, not one of {', '.join(names)}")
+    return str(value)
+
+
+def index_of(request: dict, field: str, absent: int | None = None) -> int:
+    """Return a field of a request that counts from 0; `absent` if it is not set, where there is such a value.
+
+    Raises ValueError or KeyError, as json_values does.
+    """
+    return absent if absent is not None and field not in request else whole_number(request, field)
+
+
+def cameras_of(request: dict) -> list[Camera]:
+    """Return the cameras of a request, or as many between them as it counts; raise Refusal without one.
+
+    Raises ValueError or KeyError for a camera that cannot be, as json_values does.
+    """
+    cameras = [camera_of(camera) for camera in json_list(request["cameras"], "cameras")[:MOST_VIEWS]]
+    if not cameras:
+        raise Refusal(400, "the request has no cameras")
+    return interpolate(cameras, min(whole_number(request, "count"), MOST_VIEWS)) if request.get("count") else cameras
 
 
 def own_path(path: str) -> str:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..errors import SehdrError
+from ..json_values import number, numbers, text, whole_number
 from ..model.lights import Light
 from ..output.export.splat_edits import SplatEdits
 from ..output.world_transform import world_transform, write_orientation
@@ -89,13 +90,10 @@ def edits_of(request: dict, photos: Callable[[], Sequence[View]]) -> SplatEdits 
     """Return the edits of a request: any of "crop", "cut", "min_opacity", "min_views" and "mask_only"; None for none.
 
     photos: returns the photos with their masks, for "mask_only". Raises SehdrError for a value that cannot be, or masks
-    that are not there.
+    that are not there, and ValueError for one of another type.
     """
-    edits: dict[str, Any] = {
-        name: kind(request[name])
-        for name, kind in (("crop", str), ("cut", str), ("min_opacity", float), ("min_views", int))
-        if request.get(name) is not None
-    }
+    kinds = {"crop": text, "cut": text, "min_opacity": number, "min_views": whole_number}
+    edits: dict[str, Any] = {name: read(request, name) for name, read in kinds.items() if request.get(name) is not None}
     if request.get("mask_only"):
         edits["mask_views"] = photos()
     return SplatEdits(**edits) if edits else None
@@ -120,7 +118,8 @@ def history_of(request: dict) -> list[dict]:
 
 def orient(run: Any, request: dict) -> None:
     """Keep with a run the up direction or the scale that a page sets; raise SehdrError for values that cannot be."""
-    up, scale = request.get("up"), request.get("scale")
     write_orientation(
-        run, up=None if up is None else [float(value) for value in up], scale=None if scale is None else float(scale)
+        run,
+        up=None if request.get("up") is None else numbers(request, "up", -1).tolist(),
+        scale=None if request.get("scale") is None else number(request, "scale"),
     )

@@ -21,15 +21,14 @@ from typing import Any, cast
 from PIL import Image
 
 from ..errors import SehdrError
-from ..output.cameras.paths import interpolate
+from ..json_values import damage, json_list, number
 from ..output.film import write_film
 from ..output.html import page_file
 from ..output.images.ldr_files import quantize
 from ..output.light_pictures import photo_for_display
 from ..output.render_views import render_views
 from ..output.scene_page import write_scene_page
-from ..scene import Camera
-from .clients import ClientRun, Refusal, choice, is_local, own_path
+from .clients import ClientRun, Refusal, cameras_of, choice, index_of, is_local, own_path
 from .connections import SILENCE, BusyError, ClientGone, Connection, Connections
 from .edits import edits_of, history_of, orient
 from .renderer import Renderer
@@ -37,7 +36,7 @@ from .viewer_scene import ViewerScene, camera_file, camera_of, frame_bytes
 
 log = logging.getLogger(__name__)
 PORTS_TRIED = 50
-MOST_BODY, MOST_VIEWS = 4 << 20, 2000
+MOST_BODY = 4 << 20
 MOST_SAVED = 500_000_000  # Pixels of all pictures of a save, about 3 GB; `render` has no such bound
 MOST_STOPS = 30.0
 _SAVE_END = 30.0  # Seconds that the end of the server waits for a save to notice it
@@ -116,8 +115,8 @@ class Viewer:
         return "application/octet-stream", frame
 
     def _edit(self, request: dict, client: Connection) -> Answer:
-        edits = edits_of(request, partial(self._photos_of, int(request.get("run", 0))))
-        merged = [self._run_of({"run": index}) for index in request.get("merge", ())]
+        edits = edits_of(request, partial(self._photos_of, index_of(request, "run", 0)))
+        merged = [self._run_of({"run": index}) for index in json_list(request.get("merge", []), "merge")]
         history = history_of(request)
         return self._change(request, client, lambda run: run.edit(edits, merged, history))
 
@@ -135,12 +134,12 @@ class Viewer:
         return _json(self.on_renderer(client, self._run_of(request).describe_lights))
 
     def _set_gain(self, request: dict, client: Connection) -> Answer:
-        light, stops = int(request["light"]), float(request["stops"])
+        light, stops = index_of(request, "light"), number(request, "stops")
         self.on_renderer(client, partial(self._run_of(request).set_gain, light, stops))
         return self._lights(request, client)
 
     def _path(self, request: dict, client: Connection) -> Answer:
-        return "application/json", camera_file(self._run_of(request), _cameras_of(request)).encode()
+        return "application/json", camera_file(self._run_of(request), cameras_of(request)).encode()
 
     def close(self) -> None:
         """End the work for clients, and wait for it: native code must not run while Python ends."""
@@ -166,7 +165,7 @@ class Viewer:
             raise
 
     def _run_of(self, request: dict) -> ViewerScene:
-        index = int(request.get("run", 0))
+        index = index_of(request, "run", 0)
         if not 0 <= index < len(self.runs):
             raise Refusal(404, "no such run")
         return self.runs[index]
@@ -181,7 +180,7 @@ class Viewer:
         index, _, view = name.partition("/")
         if not (index.isascii() and view.isascii() and index.isdigit() and view.isdigit() and len(name) < 20):
             raise Refusal(404, "no such photo")
-        run = self._run_of({"run": index})
+        run = self._run_of({"run": int(index)})
         if int(view) >= len(run.cameras):
             raise Refusal(404, "no such photo")
         with self._photo_lock:  # One at a time, because pictures of a large photo take much memory on the way.
@@ -197,7 +196,7 @@ class Viewer:
     def _save(self, request: dict, client: Connection) -> Answer:
         """Return what a client saves: EXR, a zip of what `render` writes, a film or a page."""
         kind = choice(request, "kind", ("exr", "brackets", "film", "page"))
-        cameras, stops = _cameras_of(request), float(request.get("stops") or 0)
+        cameras, stops = cameras_of(request), number(request, "stops") if request.get("stops") else 0.0
         run: Any = ClientRun(self.on_renderer, self._run_of(request), client)
         if not abs(stops) <= MOST_STOPS:  # NaN is not.
             raise Refusal(400, f"stops {stops} are not between -{MOST_STOPS:g} and {MOST_STOPS:g}")
@@ -239,14 +238,6 @@ class Viewer:
 
 def _json(value: Any) -> Answer:
     return "application/json", json.dumps(value).encode()
-
-
-def _cameras_of(request: dict) -> list[Camera]:
-    """Return the cameras of a request, or as many between them as it counts; raise Refusal without one."""
-    cameras = [camera_of(camera) for camera in request["cameras"][:MOST_VIEWS]]
-    if not cameras:
-        raise Refusal(400, "the request has no cameras")
-    return interpolate(cameras, min(int(request["count"]), MOST_VIEWS)) if request.get("count") else cameras
 
 
 class Server(ThreadingHTTPServer):
@@ -364,7 +355,7 @@ class _Handler(BaseHTTPRequestHandler):
         except Refusal as error:
             return error.status, "text/plain", str(error).encode()
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-            return 400, "text/plain", f"cannot be used: {error!s:.200}".encode()
+            return 400, "text/plain", f"cannot be used: {damage(error)}".encode()
         except (RuntimeError, MemoryError) as error:  # For example, a GPU without room.
             return 500, "text/plain", f"cannot be rendered: {' '.join(str(error).split())[:200]}".encode()
         except BusyError as error:

@@ -224,7 +224,7 @@ class ViewerScene:
 def camera_of(values: dict) -> Camera:
     """Return the camera that a page describes.
 
-    Raises ValueError for a bad value or too large a picture, KeyError for a missing field, TypeError for a wrong one.
+    Raises ValueError for a bad value or too large a picture, KeyError for a missing field.
     """
     camera = Camera.from_dict(values)
     if camera.pixel_count > MOST_PIXELS:

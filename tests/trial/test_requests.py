@@ -177,7 +177,7 @@ def test_saves_that_are_asked_for(served, name, tmp_path, monkeypatch):
     import tempfile
 
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr("sehdr_warp.viewer.server.MOST_VIEWS", 300)  # Many as well, and soon saved.
+    monkeypatch.setattr("sehdr_warp.viewer.clients.MOST_VIEWS", 300)  # Many as well, and soon saved.
     camera = served.camera | {"width": 8, "height": 8}
     said = answer_to(served.server_address[1], posted("/save", {"cameras": [camera]} | SAVES[name]), 60)
     assert re.match(rb"HTTP/1\.1 (200|4\d\d|5\d\d)", said) and b"Traceback" not in said and not files_in(tmp_path)

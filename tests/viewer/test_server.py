@@ -16,7 +16,8 @@ from sehdr_warp.errors import InputError
 from sehdr_warp.output.cameras.selection import select_cameras
 from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.scene import load_cameras, look_at
-from sehdr_warp.viewer.server import MOST_BODY, MOST_VIEWS, Server, Viewer
+from sehdr_warp.viewer.clients import MOST_VIEWS
+from sehdr_warp.viewer.server import MOST_BODY, Server, Viewer
 
 from ..output.helpers import camera, make, read_exr
 
@@ -150,10 +151,42 @@ def test_bad_questions_are_answered_in_a_line(serve, path, body, status):
     assert ask(server, "/scene")[0] == 200
 
 
-@pytest.mark.parametrize("kind", ["png", "EXR", "", None, 1, ["exr"], {}])
-def test_a_kind_that_is_not_saved_is_refused_with_those_that_are(serve, kind):
+@pytest.mark.parametrize(
+    "kind, words", [("png", "'png'"), ("EXR", "'EXR'"), ("", "''"), (None, "null"), (1, "1"), (["exr"], "a list of 1")]
+)
+def test_a_kind_that_is_not_saved_is_refused_with_those_that_are(serve, kind, words):
     status, _, content = ask(serve(), "/save", {"cameras": [camera().to_dict()], "kind": kind})
-    assert (status, content.decode()) == (400, f"kind {kind!r} is not one of exr, brackets, film, page")
+    assert (status, content.decode()) == (400, f"kind is {words}, not one of exr, brackets, film, page")
+
+
+VIEW = camera().to_dict()
+
+
+@pytest.mark.parametrize(
+    "path, body, words",
+    [
+        ("/frame", {}, "camera is missing"),
+        ("/frame", {"camera": [1, 2]}, "the camera is a list of 2, not an object"),
+        ("/frame", {"camera": {"width": 8}}, "height is missing"),
+        ("/frame", {"camera": VIEW | {"fx": None}}, "fx is null, not a number"),
+        ("/frame", {"camera": VIEW | {"world_to_camera": [[1, 2], [3]]}}, "world_to_camera holds 3 numbers, not 4 x 4"),
+        ("/frame", {"camera": VIEW, "run": "x"}, "run is 'x', not a whole number"),
+        ("/frame", {"camera": VIEW, "run": 0.5}, "run is 0.5, not a whole number"),
+        ("/path", {"cameras": "x"}, "cameras is 'x', not a list"),
+        ("/path", {"cameras": [VIEW], "count": 2.5}, "count is 2.5, not a whole number"),
+        ("/save", {"cameras": [VIEW], "kind": "film", "stops": {"a": 1}}, "stops is an object, not a number"),
+        ("/edit", {"crop": [1, 2]}, "crop is a list of 2, not a text"),
+        ("/edit", {"min_views": 2.5}, "min_views is 2.5, not a whole number"),
+        ("/edit", {"merge": 1}, "merge is 1, not a list"),
+        ("/orientation", {"up": [1, "x", 0]}, "up holds 'x', not one list of numbers"),
+        ("/orientation", {"scale": []}, "scale is a list of 0, not a number"),
+        ("/gain", {"stops": 1}, "light is missing"),
+        ("/gain", {"light": 0, "stops": None}, "stops is null, not a number"),
+    ],
+)
+def test_a_value_of_another_type_is_named(serve, path, body, words):
+    status, _, content = ask(serve(), path, body)
+    assert status == 400 and content.decode().startswith(f"cannot be used: {words}")
 
 
 def test_other_sites_may_not_ask(serve):
