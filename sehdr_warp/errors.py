@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from itertools import islice
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -93,8 +94,12 @@ def require_extra(module: str, purpose: str, extra: str) -> Any:
         raise SehdrError(f"{purpose}; run `pip install 'sehdr-warp[{extra}]'`") from None
 
 
-def refuse_paths(loader: str, *values: object) -> None:
-    """Raise TypeError for a path, or a list, in place of what `loader`() reads from a path."""
+_LOADED = {"load_scene": "train_views", "load_run": "render"}
+"""An attribute of what each function returns, by which other values are told from it."""
+
+
+def require_loaded(loader: str, *values: object) -> None:
+    """Raise TypeError for a path, a list or another value in place of what `loader`() reads from a path."""
     for value in values:
         if isinstance(value, list | tuple):
             raise TypeError(
@@ -102,6 +107,29 @@ def refuse_paths(loader: str, *values: object) -> None:
             )
         if isinstance(value, str | os.PathLike):
             raise TypeError(f"{os.fspath(value)!r} is a path, expected what sehdr_warp.{loader}() returns for it")
+        if not hasattr(value, _LOADED[loader]):
+            raise TypeError(f"a {type(value).__name__} is not what sehdr_warp.{loader}() returns; pass that")
+
+
+def path_of(value: object, name: str) -> Path:
+    """Return an argument as a path; raise TypeError, naming it, for what is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError(f"{name} is {value!r:.60}, expected a path, as text or pathlib.Path")
+    return Path(os.fsdecode(value))
+
+
+def require_number(value: object, name: str) -> None:
+    """Raise TypeError for an argument that is not a number."""
+    if not isinstance(value, Real):
+        raise TypeError(f"{name} is {value!r:.60}, expected a number")
+
+
+def require_whole_number(value: object, name: str, least: int = 0) -> None:
+    """Raise TypeError for an argument that is not a whole number, and SehdrError for one below `least`."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise TypeError(f"{name} is {value!r:.60}, expected a whole number")
+    if value < least:
+        raise SehdrError(f"{name} {value} is below {least}; give {least} or more")
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:

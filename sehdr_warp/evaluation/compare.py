@@ -5,14 +5,14 @@ import io
 import json
 import re
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SehdrError, refuse_paths
+from ..errors import SehdrError, require_loaded
 
 if TYPE_CHECKING:
     from ..runs.run import Run
@@ -63,7 +63,10 @@ def compare_runs(runs: "Sequence[Run]") -> list[ComparedRuns]:
     Raises:
         SehdrError: without runs, for a run that is named twice, or one without evaluations in its metrics.
     """
-    refuse_paths("load_run", *([runs] if isinstance(runs, str) else runs))
+    if isinstance(runs, str) or not isinstance(runs, Iterable):
+        raise TypeError(f"runs is {runs!r:.60}, expected a list of runs, as load_run() returns them")
+    runs = list(runs)
+    require_loaded("load_run", *runs)
     if not runs:
         raise SehdrError("compare: no runs; name their folders")
     groups: dict[str, list] = {}

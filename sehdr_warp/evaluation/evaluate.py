@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import SehdrError, refuse_paths
+from ..errors import SehdrError, require_loaded
 from ..runs.run import Run
 from ..scene import Scene, View
 from . import metrics
@@ -72,8 +72,8 @@ def evaluate(run: Run, scene: Scene, *, lpips_weights: Path | str | None = None)
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    refuse_paths("load_run", run)
-    refuse_paths("load_scene", scene)
+    require_loaded("load_run", run)
+    require_loaded("load_scene", scene)
     return Evaluation(_run_predictions(run), run.normalize_photos(scene), run.device, lpips_weights).result()
 
 

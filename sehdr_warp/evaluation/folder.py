@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from ..errors import InputError, refuse_paths
+from ..errors import InputError, path_of, require_loaded
 from ..scene import Scene
 from ..scene.file_names import safe_names
 from ..scene.images.hdr_files import read_hdr
@@ -34,8 +34,8 @@ def evaluate_folder(folder: Path | str, truth: Scene, *, lpips_weights: Path | s
         InputError: for a folder without a file of a compared view.
         SehdrError: for a picture of another size.
     """
-    refuse_paths("load_scene", truth)
-    folder = Path(folder)
+    require_loaded("load_scene", truth)
+    folder = path_of(folder, "folder")
     files = {file.stem: file for file in sorted(folder.glob("*.exr"))} if folder.is_dir() else {}
     names = [view.name for view in truth.views]
     stems = dict(zip(names, safe_names(names), strict=True))

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from ..errors import InputError
+from ..errors import InputError, path_of
 
 VARIABLE = "SEHDR_LPIPS"
 BACKBONE = "squeeze v0.1"
@@ -93,7 +93,7 @@ def load_lpips(folder: Path | str | None = None, device: torch.device | str = "c
     folder = folder or os.environ.get(VARIABLE)
     if not folder:
         return None, f"no LPIPS weights: set {VARIABLE} or name a folder with squeeze.pth and SqueezeNet 1.1"
-    folder = Path(folder)
+    folder = path_of(folder, "lpips_weights")
     if not folder.is_dir():
         raise InputError(folder, "the folder of LPIPS weights does not exist", "name the folder that holds squeeze.pth")
     backbones = [*folder.glob("squeezenet1_1_features.pth"), *sorted(folder.glob("squeezenet1_1-*.pth"))]

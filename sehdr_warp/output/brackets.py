@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SehdrError
+from ..errors import SehdrError, path_of
 from ..files import atomic_folder, atomic_path, remove, write_json
 from ..model.exposure import Exposure, Exposures, read_exposures
 from ..own_files import is_own
@@ -115,7 +115,7 @@ def write_brackets(
         TypeError: For pictures that are not floats, such as a photo's codes.
     """
     writer = BracketWriter(
-        out=Path(out),
+        out=path_of(out, "out"),
         exposures=bracket_exposures(base_time, evs=evs, exposures=exposures),
         header=PictureHeader(base_time, colorspace),
         pixel=pixel,

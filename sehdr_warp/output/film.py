@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError, SehdrError, did_you_mean, refuse_paths, require_extra
+from ..errors import InputError, SehdrError, did_you_mean, path_of, require_extra, require_loaded
 from ..files import atomic_path
 from ..progress import stage
 from ..scene import Camera
@@ -112,10 +112,11 @@ def write_film(
         TypeError: For what is not a Camera.
         InputError: If `out` exists (unless overwrite), or is not a film in one file by its suffix.
     """
-    refuse_paths("load_run", run)
+    require_loaded("load_run", run)
     _check_options(cameras, transfer, ev_ramp)
+    out = path_of(out, "out")
     av, kind = film_library(), TRANSFERS[transfer]
-    out, first, container_format = Path(out), cameras[0], film_format(out)
+    first, container_format = cameras[0], film_format(out)
     check_rate(fps)
     frames = _at_one_size(cameras, out)
     width, height = frames[0].width, frames[0].height

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import SehdrError, refuse_paths
+from ..errors import SehdrError, require_loaded
 from ..model.baking import field_of, gaussians_of, with_photo_filters
 from ..runs.run import RenderableScene, on_device
 from ..scene.camera_focus import camera_positions
@@ -73,7 +73,7 @@ def merge_scenes(run: RenderableScene, *others: RenderableScene) -> MergedScene:
         SehdrError: If some scenes are rendered with opacity compensation, as small files are, and the low-pass filter
             of another one is not known, which would have to be included in its sizes.
     """
-    refuse_paths("load_run", run, *others)
+    require_loaded("load_run", run, *others)
     for other in others:
         if _have_own_worlds(run, other):
             problem = "were found apart, so their coordinates differ, and the scenes do not fit together"

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import SehdrError, refuse_paths
+from ..errors import SehdrError, path_of, require_loaded
 from ..files import atomic_folder, atomic_path
 from ..model.exposure import Exposures
 from ..progress import track_progress
@@ -105,10 +105,10 @@ def render_views(
         SehdrError: For unusable options or an empty set of cameras.
         InputError: If a file would be replaced or a pixel is not finite.
     """
-    refuse_paths("load_run", run)
+    require_loaded("load_run", run)
     options = {"multipart": multipart, "ldr_brackets": ldr_brackets, "group_by": group_by, "ocio": ocio, "view": view}
     check_options(cameras, size, aovs=aovs, evs=evs, exposures=exposures, pixel=pixel, **options)
-    out, aov_names = Path(out), read_aovs(aovs)
+    out, aov_names = path_of(out, "out"), read_aovs(aovs)
     transform = world_transform(run, axes, up=up, scale=scale)
     views = select_cameras(run, cameras, camera=camera, count=count, size=size, transform=transform, up=up)
     camera_files = _camera_files(run, views, transform, fps, moves=may_move(cameras))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import refuse_paths
+from ..errors import path_of, require_loaded
 from ..files import atomic_path, check_absent
 from ..kernels.constants import EPS2D, FRUSTUM_MARGIN, NEAR_PLANE
 from ..model.baking import field_of, gaussians_of
@@ -50,8 +50,8 @@ def write_scene_page(
     Raises:
         InputError: If the file exists (unless overwrite), or a value is not finite.
     """
-    refuse_paths("load_run", run)
-    path = Path(path)
+    require_loaded("load_run", run)
+    path = path_of(path, "path")
     check_absent(path, overwrite)
     opening = opening_facts(run)
     cameras = split_or_all(run, "train")

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, SehdrError, refuse_paths
+from ..errors import InputError, SehdrError, require_loaded
 from ..files import read_json, write_json
 from ..runs.values import ORIENTATION_FILE
 from ..scene import Camera
@@ -247,7 +247,7 @@ def write_orientation(run: "RenderableScene", *, up: Sequence[float] | None = No
     Raises:
         SehdrError: For a file of Gaussians, or a value that cannot be.
     """
-    refuse_paths("load_run", run)
+    require_loaded("load_run", run)
     path = Path(run.path) / ORIENTATION_FILE
     if not path.parent.is_dir():
         raise SehdrError(f"{run.path}: is not a run; up and scale of a file of Gaussians are set by --up and --scale")

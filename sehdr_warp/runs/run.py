@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import InputError, SehdrError
+from ..errors import InputError, SehdrError, path_of
 from ..model.baking import field_of
 from ..model.color_models import rec709_of
 from ..model.confidence import Evidence, gather_evidence
@@ -214,7 +214,7 @@ def load_splats(path: Path | str, *, device: str | torch.device = "cpu") -> Spla
         InputError: If the file, or the cameras.json beside it, is missing, damaged or of another kind, or for a device
             that torch cannot use.
     """
-    path = Path(path)
+    path = path_of(path, "path")
     gaussians = read_gaussians(path)
     field = on_device(field_of(gaussians), pick_device(device))
     beside, cameras = cameras_beside(path), ()
@@ -317,7 +317,7 @@ def load_run(path: Path | str, *, device: str | torch.device = "cpu") -> Run:
         InputError: With file and field, if the folder is not a run, or has no usable checkpoint; for a device that
             torch cannot use.
     """
-    folder = RunFolder(path)
+    folder = RunFolder(path_of(path, "path"))
     folder.require()
     info, config = folder.read_info(), folder.read_config()
     checkpoint = folder.newest_checkpoint(RENDER_TENSORS)

@@ -10,7 +10,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import InputError, did_you_mean, missing
+from ..errors import InputError, SehdrError, did_you_mean, missing, path_of, require_whole_number
 from ..files import has_file
 from ..subsets import first_names
 from .camera_checks import check_cameras
@@ -32,7 +32,7 @@ from .readers.meshroom import find_sfm, read_meshroom
 from .readers.opensfm import find_reconstruction, read_opensfm
 from .readers.photo_copies import without_copied_tests
 from .readers.transforms import is_transforms, read_transforms
-from .response_choice import check_response, choose_response
+from .response_choice import check_response, check_response_type, choose_response
 from .truth_files import assign_truth
 from .types import Scene
 from .unused_files import ARCHIVE_SUFFIXES, unread_geometry, unused_notes
@@ -46,6 +46,7 @@ _MARK = "transforms_train.json"  # A file of every embedded scene
 _HOLDOUT = 8  # Every eighth view is held out, as LLFF, Mip-NeRF 360 and 3DGS do
 # Layouts that do not say where truth lies.
 _WITH_TRUTH = ("colmap", "transforms", "opensfm", "meshroom", "arkit", "llff", "photos")
+METHODS, STORAGES = ("posterior", "paper"), ("auto", "memory", "disk")
 _FEWEST_FOR_TEST = 5  # In smaller sets no view is held out
 
 
@@ -96,11 +97,17 @@ def load_scene(
         InputError: if a file of the set is missing, damaged or hostile, an exposure is impossible, fewer than two
             training views remain, or the photos show nothing but black or white. Single photos that cannot be used are
             left out, and a note names them.
+        TypeError: for an argument of another type.
+        SehdrError: for an unknown method or storage.
     """
     from ..response import response_by_name, responses_named
 
-    if max_size is not None and not (isinstance(max_size, Real) and max_size >= 1):
+    if max_size is not None and (isinstance(max_size, bool) or not isinstance(max_size, Real) or not max_size >= 1):
         raise InputError(path, f"longest side of {max_size!r:.60} pixels asked for", "give at least 1 pixel")
+    for name, value, names in (("method", method, METHODS), ("photo_storage", photo_storage, STORAGES)):
+        if value not in names:
+            raise SehdrError(f"{name} {value!r:.60} is not one of {', '.join(names)}")
+    _check_lists(candidates, views, cameras)
     if isinstance(response, str | Path) and str(response) not in ("auto", "learned", "linear"):
         response_by_name(response)  # An unknown name is refused before the photos are read.
     for candidate in candidates:
@@ -130,6 +137,18 @@ def load_scene(
         light_known=dataset.kind != "encoded" or curve.name == dataset.stated_response,
         unplaced=dataset.unplaced,
     )
+
+
+def _check_lists(candidates: object, views: object, cameras: Sequence[object]) -> None:
+    """Raise TypeError for a text or another value in place of a list, and SehdrError for a list of no views."""
+    for name, value in {"candidates": candidates, "views": views}.items():
+        if isinstance(value, str) or not isinstance(value, Collection | None):
+            raise TypeError(f"{name} is {value!r:.60}, expected a list of names")
+    if views is not None and not views:
+        raise SehdrError("views is empty; name views, or leave views out to read all")
+    if isinstance(cameras, str) or not all(isinstance(camera, PlacedPhoto) for camera in cameras):
+        kind = cameras if isinstance(cameras, str) else next(type(camera).__name__ for camera in cameras)
+        raise TypeError(f"cameras has {kind!r:.60}, expected those of bare photos that a run keeps (PlacedPhoto)")
 
 
 def _with_all_times(
@@ -164,8 +183,10 @@ def parse_dataset(
     Everything that can refuse a set is checked before structure from motion, which takes minutes; so is a response that
     does not apply. Arguments and errors are those of load_scene().
     """
-    if holdout is not None and holdout < 0:
-        raise InputError(path, f"every {holdout}th view asked for as test view", "give 0 (none) or more")
+    for name, value in {"holdout": holdout, "exposure_index": exposure_index}.items():
+        if value is not None:
+            require_whole_number(value, name)
+    check_response_type(response)
     folder = _folder(path)
     dataset = read_video(folder, cache) if is_video(folder) else _read(folder, cameras)
     name = str(path) if is_embedded(path) else folder.resolve().name
@@ -227,7 +248,7 @@ def _folder(path: Path | str) -> Path:
     """Return the folder of a data set, or a video or transforms.json; raise InputError for anything else."""
     if is_embedded(path):
         return embedded_folder(str(path))
-    folder = Path(path)
+    folder = path_of(path, "path")
     if is_video(folder) or is_transforms(folder):
         return folder
     try:

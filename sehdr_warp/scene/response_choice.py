@@ -41,6 +41,14 @@ class ResponseChoice:
     chosen_by: tuple[str, tuple[str, ...]] | None = None  # As in Scene
 
 
+def check_response_type(response: object) -> None:
+    """Raise TypeError for what is neither a name or a file nor a curve."""
+    from ..response import Response
+
+    if not isinstance(response, str | Path | Response):
+        raise TypeError(f"response is {response!r:.60}, expected a name, a file, or what response_by_name() returns")
+
+
 def choose_response(
     dataset: DataparserOutputs, response: "str | Path | Response", method: str, candidates: Sequence[str]
 ) -> ResponseChoice:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from ..errors import InputError, SehdrError, refuse_paths
+from ..errors import InputError, SehdrError, require_loaded
 from ..model.baking import field_of, gaussians_of, to_normalized
 from ..model.color_models import make_color_model
 from ..model.gaussians import Gaussians
@@ -193,7 +193,7 @@ def match_points(
     Returns:
         [N, 3] points, and their encoded colors [N, 3] in [0, 1].
     """
-    refuse_paths("load_scene", scene)
+    require_loaded("load_scene", scene)
     normalization = normalization_of(scene)
     response = response or scene.response or response_by_name("srgb")
     points, colors = _match_points(make_matcher(normalization.scene(scene), response, device), count, seed)

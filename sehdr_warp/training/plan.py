@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from ..errors import InputError, refuse_paths
+from ..errors import InputError, require_loaded
 from ..model.exposure import exposure_times, is_seconds
 from ..parallel import thread_count
 from ..progress import format_duration
@@ -147,7 +147,7 @@ def make_plan(
     Raises:
         InputError: For a scene that cannot be trained, and for fields in plan.keep that the scene contradicts.
     """
-    refuse_paths("load_scene", scene)
+    require_loaded("load_scene", scene)
     device, config = pick_device(device), as_config(config) or Config()
     facts = measure_scene(scene, config.seed)
     check_scene(scene, facts)

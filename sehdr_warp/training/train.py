@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from ..errors import InputError, refuse_paths
+from ..errors import InputError, path_of, require_loaded
 from ..rasterizer.memory import TRAINING_REMEDY, oom_context
 from ..runs.config import Config
 from ..runs.config_files import as_config, config_fields, override_config, require_same_config, with_iterations_of
@@ -96,14 +96,14 @@ def create_trainer(
         InputError: If scene, folder or config cannot be used.
         SehdrError: If the disk or the memory is full.
     """
-    refuse_paths("load_scene", scene)
+    require_loaded("load_scene", scene)
     states_iterations = isinstance(config, Config) or (
         isinstance(config, Mapping) and not config.keys().isdisjoint(("schedule", "schedule.iterations"))
     )
     device, config = pick_device(device), as_config(config)
     if tensorboard:
         summary_writer()
-    folder = RunWriter(out)
+    folder = RunWriter(path_of(out, "out"))
     with oom_context(device, lambda: sizes_of(scene), TRAINING_REMEDY):
         has_run = folder.check_start(resume=resume, overwrite=overwrite)
         try:

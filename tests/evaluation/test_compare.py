@@ -17,9 +17,8 @@ def trained(path, *, seed=0, iterations=100, ldr=(20.0, 25.0), mu=(None, 30.0)):
     ]
     config = Config(seed=seed, schedule={"iterations": iterations})
     facts = {"iterations": iterations, "gaussian_count": 1000 + seed, "train_seconds": 8.0 + seed}
-    return SimpleNamespace(
-        path=path, config=config, metrics=lambda: lines, scene_name="room_1", data={"path": "embedded"}, **facts
-    )
+    facts |= {"scene_name": "room_1", "data": {"path": "embedded"}, "render": None}
+    return SimpleNamespace(path=path, config=config, metrics=lambda: lines, **facts)
 
 
 def test_runs_that_differ_by_their_seed_share_a_row(tmp_path):

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ...errors import InputError, SehdrError, did_you_mean, refuse_paths
+from ...errors import InputError, SehdrError, did_you_mean, require_loaded
 from ...scene import Camera
 from ...scene.camera import MAX_SIDE
 from ...scene.file_names import safe_names
@@ -51,7 +51,7 @@ def select_cameras(
     Raises:
         SehdrError: If there are none, or `cameras` is neither a known name nor a file.
     """
-    refuse_paths("load_run", run)
+    require_loaded("load_run", run)
     check_cameras(cameras)
     text = str(cameras)
     if not run.cameras and camera is None and text in SPLITS + PATHS:

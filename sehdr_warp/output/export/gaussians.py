@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError, SehdrError, refuse_paths
+from ...errors import InputError, SehdrError, path_of, require_loaded
 from ...files import atomic_path
 from ...model.baking import field_of, fit_to_pictures, gaussians_of, psnr_of, with_photo_filters
 from ...response import response_by_name
@@ -87,8 +87,8 @@ def export(
         SehdrError: For options that do not fit, or edits that leave nothing.
         InputError: For an unknown suffix, if a file exists, or if a value is not finite.
     """
-    refuse_paths("load_run", run)
-    path, edits = Path(path), SplatEdits() if edits is None else edits
+    require_loaded("load_run", run)
+    path, edits = path_of(path, "path"), SplatEdits() if edits is None else edits
     if not isinstance(edits, SplatEdits):
         raise TypeError(f"edits is a {type(edits).__name__}, expected SplatEdits, such as SplatEdits(min_views=2)")
     file_model = required_color_model(path)

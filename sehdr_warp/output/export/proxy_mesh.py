@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...errors import InputError, SehdrError, refuse_paths
+from ...errors import InputError, SehdrError, path_of, require_loaded
 from ...files import atomic_path, check_absent
 from ...progress import track_progress
 from ...runs.run import RenderableScene
@@ -117,8 +117,8 @@ def write_proxy_mesh(
         InputError: For an unknown suffix, or if the file exists.
         SehdrError: If scikit-image or OpenUSD is missing, for values out of range, or if there is no surface.
     """
-    refuse_paths("load_run", run)
-    path, region = Path(path), check_mesh(path, resolution, crop, overwrite)
+    require_loaded("load_run", run)
+    path, region = path_of(path, "path"), check_mesh(path, resolution, crop, overwrite)
     transform = world_transform(run, axes, up=up, scale=scale)
     mesh = proxy_mesh(run, transform, up=up, resolution=resolution, region=region)
     with atomic_path(path, overwrite) as temporary:

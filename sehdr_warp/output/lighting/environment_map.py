@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...errors import SehdrError, refuse_paths
+from ...errors import SehdrError, path_of, require_loaded
 from ...files import check_absent
 from ...scene.camera_focus import camera_positions
 from ...scene.wide_camera import typical_focal_length
@@ -101,8 +101,8 @@ def write_environment_map(
         SehdrError: For options that do not fit, or a point from which next to nothing is visible.
         InputError: If the file exists or a pixel is not finite.
     """
-    refuse_paths("load_run", run)
-    path = Path(path)
+    require_loaded("load_run", run)
+    path = path_of(path, "path")
     check_map(path, size, layout, axes, beyond, pixel)
     size = size or LAYOUTS[layout]
     color_space(colorspace)

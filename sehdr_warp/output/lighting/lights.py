@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...errors import SehdrError, refuse_paths
+from ...errors import SehdrError, path_of, require_loaded
 from ...files import atomic_path, check_absent
 from ...model.lights import Light, ReceivedLight, light_name, received_light
 from ...runs.run import RenderableScene, Run
@@ -120,8 +120,8 @@ def write_lights(
         SehdrError: For a suffix that is not known, or a scene that does not state what clipped.
         InputError: If a file exists.
     """
-    refuse_paths("load_run", run)
-    path = Path(path)
+    require_loaded("load_run", run)
+    path = path_of(path, "path")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise SehdrError(f"{path}: lights are written as one of {', '.join(SUFFIXES)}; choose a suffix")

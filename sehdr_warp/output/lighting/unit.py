@@ -11,7 +11,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...errors import InputError, SehdrError, refuse_paths
+from ...errors import InputError, SehdrError, require_loaded
 from ...files import read_json, write_json
 from ...json_values import damage, number, numbers, text
 from ...runs.values import LIGHT_UNIT_FILE
@@ -95,7 +95,7 @@ def meter(
         TypeError: For a reading that is not a number.
         SehdrError: For a view or place that is not there, or values that cannot be.
     """
-    refuse_paths("load_run", run)
+    require_loaded("load_run", run)
     entry = find_view(run, view)
     view, camera = entry.name, entry.camera
     try:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, SehdrError, refuse_paths
+from ...errors import InputError, SehdrError, path_of, require_loaded
 from ...files import atomic_path, check_absent
 from ...own_files import first_unlisted
 from ...progress import track_progress
@@ -70,9 +70,10 @@ def write_report(
         InputError: If a file exists, or the folder holds photos.
         SehdrError: For a scene without views.
     """
-    refuse_paths("load_run", run)
-    refuse_paths("load_scene", scene)
-    check_report_folder(Path(out))
+    require_loaded("load_run", run)
+    require_loaded("load_scene", scene)
+    out = path_of(out, "out")
+    check_report_folder(out)
     metrics = run.metrics()
     charted = any(training_points(metrics, key) for key in PANELS)
     names = ("report.html", "comparison.png", "stops.png", *["training.png"] * charted)

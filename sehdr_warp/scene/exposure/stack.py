@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, path_of
 from ...progress import track_progress
 from ..dataparser import UNPLACED, ImageRecord
 from ..file_names import list_images
@@ -124,8 +124,8 @@ def calibrate(
     from ...files import atomic_path, check_absent
     from ...response.calibration import CHANNELS, calibrate_codes
 
-    folder = Path(stack)
-    paths = [] if out is None else [Path(out), Path(out).with_suffix(".png")]
+    folder = path_of(stack, "stack")
+    paths = [] if out is None else [path_of(out, "out"), path_of(out, "out").with_suffix(".png")]
     if paths and paths[0].suffix.lower() != ".csv":
         raise InputError(paths[0], "the curve is a CSV file", f"name it {paths[0].with_suffix('.csv').name}")
     for path in paths:

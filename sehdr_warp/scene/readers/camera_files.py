@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, path_of
 from ...files import read_json, read_text
 from ...json_values import damage, number, numbers, shown, text, whole_number
 from ..camera import Camera
@@ -39,7 +39,7 @@ def load_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     Raises:
         InputError: if the file is damaged, a pose or size is not possible, or two cameras share a name.
     """
-    return read_camera_file(Path(path)).cameras
+    return read_camera_file(path_of(path, "path")).cameras
 
 
 def read_camera_file(path: Path) -> ExchangeCameras:
