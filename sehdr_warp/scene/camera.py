@@ -6,13 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..errors import require_number, require_whole_number
 from ..json_values import json_object, number, numbers, text, whole_number
 
 FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """COLMAP's fisheye models that are radial."""
 PROJECTIONS = ("pinhole", "equirectangular", *FISHEYES)
+_DISTORTIONS = {"OPENCV_FISHEYE": 4, "RADIAL_FISHEYE": 2, "SIMPLE_RADIAL_FISHEYE": 1}
+"""Number of parameters behind the principal point, where there are any."""
 MAX_SIDE = 1 << 20  # Pixels of a side of an image that can be rendered
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # Pixels of a focal length; beyond them single precision cannot project
+_PARALLEL = 1e-9  # Sine of the least angle between up and the direction of view
 MAX_DISTANCE = 1e18  # Length of the translation of a pose, whose square a float32 must hold
 
 
@@ -26,15 +30,36 @@ def look_at(position: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0), up: ArrayL
     """Return the world_to_camera matrix [4, 4] of a camera at `position` that looks at `target`.
 
     Its image is upright with respect to `up`, which must not be parallel to the direction of view.
+
+    Raises:
+        ValueError: for other than three finite numbers, a target at the position, or a parallel `up`.
     """
+    points = {"position": position, "target": target, "up": up}
+    for name, point in points.items():
+        if not _are_numbers(point, (3,)):
+            raise ValueError(f"{name} is {point!r:.60}, expected three finite numbers")
     position = np.asarray(position, float)
-    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
+    forward = np.subtract(target, position)
+    if not np.linalg.norm(forward) > 0:
+        raise ValueError(f"target is the position, {position.tolist()}; look at another point")
+    forward /= np.linalg.norm(forward)
     right = np.cross(forward, np.asarray(up, float))
+    if not np.linalg.norm(right) > _PARALLEL * np.linalg.norm(up):
+        raise ValueError(f"up {np.asarray(up, float).tolist()} is parallel to the direction of view; give another")
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ position
     return pose
+
+
+def _are_numbers(value: Any, shape: tuple[int, ...]) -> bool:
+    """Return whether a value is an array, or lists, of finite numbers of a shape."""
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError, RuntimeError):  # Ragged lists, or a tensor of a GPU or with a gradient
+        return False
+    return array.dtype.kind in "iuf" and array.shape == shape and bool(np.isfinite(array).all())
 
 
 class ProjectedPoints(NamedTuple):
@@ -67,7 +92,9 @@ class Camera:
         distortion: the fisheye model's parameters behind the principal point.
 
     Raises:
-        ValueError: if a size or focal length is out of range, a value is not finite or the pose is not rigid.
+        ValueError: if a size or focal length is out of range, a value is not finite, the pose is not rigid, or the
+            projection has another number of distortion parameters.
+        TypeError: for a size, length or center that is not a number.
     """
 
     width: int
@@ -82,7 +109,15 @@ class Camera:
 
     def __post_init__(self):
         """Check the values and copy the pose."""
-        pose = np.array(self.world_to_camera, dtype=np.float64)
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):
+            if not hasattr(value := getattr(self, name), "__float__"):
+                raise TypeError(f"{name} is {value!r:.60}, expected a number")
+        pose = self.world_to_camera
+        if hasattr(pose, "detach"):  # A tensor, perhaps with a gradient or of a GPU
+            pose = pose.detach().cpu().numpy()  # pyright: ignore[reportAttributeAccessIssue]
+        if not _are_numbers(pose, (4, 4)):
+            raise ValueError("world_to_camera is not a finite 4 x 4 matrix")
+        pose = np.array(pose, dtype=np.float64)
         pose.setflags(write=False)
         object.__setattr__(self, "world_to_camera", pose)
         if self.width % 1 or self.height % 1:  # True for NaN and infinity, too
@@ -97,8 +132,10 @@ class Camera:
             raise ValueError(f"camera fx, fy, cx, cy = {self.intrinsics.tolist()} are not finite")
         if self.projection not in PROJECTIONS:
             raise ValueError(f"projection {self.projection!r:.40} is not one of {', '.join(PROJECTIONS)}")
-        if not np.isfinite(self.distortion).all():
-            raise ValueError("distortion is not finite")
+        count = _DISTORTIONS.get(self.projection, 0)
+        if not _are_numbers(self.distortion, (count,)):
+            problem = f"distortion is {self.distortion!r:.60}, expected {count} finite numbers"
+            raise ValueError(f"{problem}, as {self.projection} has")
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths ({self.fx}, {self.fy}) are not positive")
         if min(self.fx, self.fy) < MIN_FOCAL or max(self.fx, self.fy) > MAX_FOCAL:
@@ -106,8 +143,6 @@ class Camera:
             raise ValueError(problem)
         if max(abs(self.cx), abs(self.cy)) > MAX_FOCAL:
             raise ValueError(f"cx, cy = {self.cx:g}, {self.cy:g} are beyond {MAX_FOCAL:g} pixels")
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError("world_to_camera is not a finite 4 x 4 matrix")
         if np.abs(pose[:3, 3]).max() > MAX_DISTANCE:
             raise ValueError(f"world_to_camera moves by more than {MAX_DISTANCE:g}")
         rotation = pose[:3, :3]
@@ -169,12 +204,16 @@ class Camera:
 
     def resized(self, width: int, height: int) -> "Camera":
         """Return the same view at another size; principal point and focal lengths scale with each axis."""
+        require_number(width, "width")
+        require_number(height, "height")
         sx, sy = width / self.width, height / self.height
         scaled = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
         return replace(self, width=width, height=height, **scaled)
 
     def within(self, max_size: int | None) -> "Camera":
-        """Return the same view with at most max_size pixels on its longest side."""
+        """Return the same view with at most max_size pixels on its longest side; None keeps its size."""
+        if max_size is not None:
+            require_whole_number(max_size, "max_size", 1)
         return self.resized(*limited_size(self.width, self.height, max_size))
 
     def to_dict(self) -> dict[str, Any]:

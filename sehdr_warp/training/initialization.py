@@ -5,17 +5,19 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from numbers import Real
 
 import numpy as np
 import torch
 
-from ..errors import InputError, SehdrError, require_loaded
+from ..errors import InputError, SehdrError, require_loaded, require_whole_number
 from ..model.baking import field_of, gaussians_of, to_normalized
 from ..model.color_models import make_color_model
 from ..model.gaussians import Gaussians
 from ..model.radiance_field import RadianceField
 from ..response import Response, ToneMapper, response_by_name
 from ..runs.config import Config
+from ..runs.device import pick_device
 from ..runs.field import assemble_field
 from ..scene import Camera, Scene, View
 from ..scene.normalization import Normalization, normalization_of
@@ -192,11 +194,20 @@ def match_points(
 
     Returns:
         [N, 3] points, and their encoded colors [N, 3] in [0, 1].
+
+    Raises:
+        TypeError: For an argument of another type.
+        SehdrError: For a count below 1, fewer than two training views, or a device that torch cannot use.
     """
     require_loaded("load_scene", scene)
+    require_whole_number(count, "count", 1)
+    require_whole_number(seed, "seed")
+    if not isinstance(response, Response | None):
+        raise TypeError(f"response is {response!r:.60}, expected a curve, as response_by_name() returns it")
+    check_views(scene)
     normalization = normalization_of(scene)
     response = response or scene.response or response_by_name("srgb")
-    points, colors = _match_points(make_matcher(normalization.scene(scene), response, device), count, seed)
+    points, colors = _match_points(make_matcher(normalization.scene(scene), response, pick_device(device)), count, seed)
     return normalization.scene_points(points), colors
 
 
@@ -228,7 +239,29 @@ def depth_of_points(scene: Scene) -> float:
 
 
 def check_views(scene: Scene) -> None:
-    """Raise InputError for a scene with too few views, or whose photos are all black or white."""
+    """Raise InputError for a scene with too few views, or whose photos are all black or white.
+
+    Likewise for values that a scene built in code may have: photos of another size than their camera's, times, splits
+    and points that cannot be.
+    """
+    for view in scene.views:
+        height, width = view.codes.shape[:2]
+        if (width, height) != (view.camera.width, view.camera.height):
+            size = f"{view.camera.width} x {view.camera.height}"
+            remedy = "give each photo a camera of its size, as view.camera.resized(width, height)"
+            raise InputError(scene.name, f"view {view.name} is {width} x {height}, its camera {size}", remedy)
+        if not (isinstance(view.exposure_time, Real) and 0 < view.exposure_time < math.inf):
+            problem = f"view {view.name} has exposure_time = {view.exposure_time!r:.40}"
+            raise InputError(scene.name, problem, "give seconds above 0; 1 for all if none are known")
+        if view.split not in ("train", "test"):
+            raise InputError(scene.name, f"view {view.name} has split = {view.split!r:.40}", "give train or test")
+    points, colors = np.shape(scene.points), np.shape(scene.point_colors)
+    if len(points) != 2 or points[1] != 3 or colors != points:
+        problem = f"points and point_colors have shapes {list(points)} and {list(colors)}, not both [P, 3]"
+        raise InputError(scene.name, problem, "give a color for each point, or no points")
+    if len(colors) and not np.asarray(scene.point_colors).max(initial=0) <= 1:
+        problem = f"point_colors reach {np.asarray(scene.point_colors).max():g}, not encoded values in [0, 1]"
+        raise InputError(scene.name, problem, "divide codes by 255")
     views = scene.train_views
     if len(views) < 2:
         remedy = "a scene needs at least two photos from different places"

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
-from sehdr_warp.scene import Camera
+from sehdr_warp.errors import SehdrError
+from sehdr_warp.scene import Camera, look_at
 from sehdr_warp.scene.camera import limited_size
 
 
@@ -39,3 +41,58 @@ def test_half_a_size_is_a_size():
 def test_limited_size():
     assert limited_size(2832, 2128, 400) == (400, 301) and limited_size(30, 20, 400) == (30, 20)
     assert limited_size(5000, 2, 100) == (100, 1) and limited_size(30, 20, None) == (30, 20)
+
+
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        ({"width": "8"}, "width is '8', expected a number"),
+        ({"fx": None}, "fx is None, expected a number"),
+        ({"cy": [1, 2]}, r"cy is \[1, 2\], expected a number"),
+        ({"world_to_camera": "eye"}, "world_to_camera is not a finite 4 x 4 matrix"),
+        ({"world_to_camera": [[1, 2], [3]]}, "world_to_camera is not a finite 4 x 4 matrix"),
+        ({"world_to_camera": np.diag([1e200, 1, 1, 1])}, "rotation of world_to_camera is not a proper rotation"),
+        ({"distortion": (0.1,)}, r"distortion is \(0.1,\), expected 0 finite numbers, as pinhole has"),
+        ({"distortion": None}, "distortion is None, expected 0 finite numbers"),
+        ({"projection": "OPENCV_FISHEYE", "distortion": (0.1,)}, "expected 4 finite numbers, as OPENCV_FISHEYE has"),
+        ({"projection": "OPENCV_FISHEYE", "distortion": "abcd"}, "distortion is 'abcd', expected 4 finite numbers"),
+    ],
+)
+def test_values_of_another_type_are_named(values, words):
+    known = {"width": 8, "height": 6, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0, "world_to_camera": np.eye(4)}
+    with pytest.raises((TypeError, ValueError), match=words):
+        Camera(**known | values)
+
+
+def test_a_pose_that_is_trained_makes_a_camera():
+    pose = torch.eye(4, requires_grad=True)
+    np.testing.assert_array_equal(Camera(8, 6, 5, 5, 4, 3, pose).world_to_camera, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda camera: camera.resized("8", 6), "width is '8', expected a number"),
+        (lambda camera: camera.within("8"), "max_size is '8', expected a whole number"),
+        (lambda camera: camera.within(0), "max_size 0 is below 1"),
+    ],
+)
+def test_sizes_that_cannot_be_are_named(call, words):
+    with pytest.raises((TypeError, SehdrError), match=words):
+        call(Camera(8, 6, 5, 5, 4, 3, np.eye(4)))
+
+
+@pytest.mark.parametrize(
+    "points, words",
+    [
+        (((1, 2, 3), (1, 2, 3)), "target is the position"),
+        (((0, 0, -3), (0, 0, 0), (0, 0, 2)), "up .* is parallel to the direction of view"),
+        (((0, 0, -3), (0, 0, 0), (0, 0, 0)), "up .* is parallel to the direction of view"),
+        (((0, 0),), r"position is \(0, 0\), expected three finite numbers"),
+        (((0, float("nan"), 0),), "position is .*, expected three finite numbers"),
+        (((0, 0, 1), "abc"), "target is 'abc', expected three finite numbers"),
+    ],
+)
+def test_points_from_which_no_view_follows_are_named(points, words):
+    with pytest.raises(ValueError, match=words):
+        look_at(*points)
