@@ -124,11 +124,11 @@ def require_number(value: object, name: str) -> None:
         raise TypeError(f"{name} is {value!r:.60}, expected a number")
 
 
-def require_whole_number(value: object, name: str, least: int = 0) -> None:
-    """Raise TypeError for an argument that is not a whole number, and SehdrError for one below `least`."""
+def require_whole_number(value: object, name: str, least: int | None = None) -> None:
+    """Raise TypeError for an argument that is not a whole number, and SehdrError for one below `least`, unless None."""
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise TypeError(f"{name} is {value!r:.60}, expected a whole number")
-    if value < least:
+    if least is not None and value < least:
         raise SehdrError(f"{name} {value} is below {least}; give {least} or more")
 
 

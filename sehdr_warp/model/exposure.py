@@ -7,7 +7,7 @@ base                    the photos' exposure itself
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -82,7 +82,9 @@ def is_seconds(item: str | float) -> bool:
 
 
 def _exposures(items: Exposures, base_time: float | None, field: str) -> list[Exposure]:
-    """Parse each item of a list or of text separated by commas."""
+    """Parse each item of a list or of text separated by commas; raise TypeError for what is neither."""
+    if not isinstance(items, str | Iterable):
+        raise TypeError(f"{field} is {items!r:.60}, expected a list, or text with commas")
     items = [item for item in items.split(",") if item.strip()] if isinstance(items, str) else items
     return [_exposure(item, base_time, field) for item in items]
 

@@ -17,6 +17,7 @@ from ..files import atomic_folder, atomic_path, remove, write_json
 from ..model.exposure import Exposure, Exposures, read_exposures
 from ..own_files import is_own
 from ..scene import Camera
+from ..scene.camera import require_camera
 from ..scene.file_names import safe_names
 from .images.colorspace import from_rec709
 from .images.exr import PAST_HALF, check_finite, check_pixel_type, stored_pixel_type, write_multipart_exr
@@ -45,6 +46,8 @@ def bracket_exposures(
             outside 1e-6 to 1e6 seconds.
     """
     if evs is not None and exposures is None:
+        if not isinstance(evs, str | Iterable):
+            raise TypeError(f"evs is {evs!r:.60}, expected a list of stops, or text with commas")
         stops = [ev for ev in evs.split(",") if ev.strip()] if isinstance(evs, str) else evs
         name, bracket = "evs", read_exposures([_stops_item(ev) for ev in stops], base_time, "evs")
     elif exposures is not None and evs is None:
@@ -124,16 +127,33 @@ def write_brackets(
         response=response,
         group_by=group_by,
     )
-    pairs: Any = views.items() if isinstance(views, Mapping) else views
-    radiances: list[tuple[str, np.ndarray]] = list(pairs)
-    if not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in radiances):
-        raise TypeError("views is neither a dict of names and their radiance [H, W, 3] nor a list of such pairs")
+    radiances = _radiances(views)
+    cameras = {} if cameras is None else cameras
+    if not isinstance(cameras, Mapping):
+        raise TypeError(f"cameras is a {type(cameras).__name__}, expected a dict of names and Cameras")
+    names = [name for name, _ in radiances]
+    for name, camera in cameras.items():
+        require_camera(camera)
+        if name not in names:
+            raise SehdrError(f"cameras has {name!r:.60}, which is not one of the views")
     with writer.open(overwrite):
-        for file_name, (name, radiance) in zip(safe_names([name for name, _ in radiances]), radiances, strict=True):
-            writer.write(file_name, radiance, (cameras or {}).get(name))
+        for file_name, (name, radiance) in zip(safe_names(names), radiances, strict=True):
+            writer.write(file_name, radiance, cameras.get(name))
     if overwrite and ldr is None:
         remove_earlier(writer.out, ["brackets_ldr"])
     return writer.files()
+
+
+def _radiances(views: Any) -> list[tuple[str, Any]]:
+    """Return the pairs of names and radiance of views; raise TypeError for another value, SehdrError for none."""
+    pairs = views.items() if isinstance(views, Mapping) else views
+    radiances = list(pairs) if isinstance(pairs, Iterable) else [pairs]
+    for pair in radiances:
+        if not (isinstance(pair, tuple | list) and len(pair) == 2 and isinstance(pair[0], str)):
+            raise TypeError("views is neither a dict of names and their radiance [H, W, 3] nor a list of such pairs")
+    if not radiances:
+        raise SehdrError("views is empty; give the radiance of a view at least")
+    return radiances
 
 
 def remove_earlier(out: Path, names: Iterable[str]) -> None:
@@ -174,6 +194,8 @@ class BracketWriter:
             raise SehdrError(f"LDR brackets {self.ldr!r} are not one of {', '.join(LDR_FORMATS)}")
         if self.ldr is not None and self.response is None:
             raise SehdrError("LDR brackets need a camera response; pass response, or leave out ldr")
+        if self.response is not None and (isinstance(self.response, str) or not hasattr(self.response, "encode")):
+            raise TypeError(f"response is {self.response!r:.60}, expected a curve, as response_by_name() returns it")
 
     @contextmanager
     def open(self, overwrite: bool = False) -> Iterator[None]:
@@ -216,7 +238,10 @@ class BracketWriter:
             TypeError: For values that are not floats.
             ValueError: For another shape.
         """
-        values = radiance.detach().cpu() if hasattr(radiance, "detach") else radiance  # A tensor, perhaps of a GPU
+        values = radiance
+        if hasattr(radiance, "detach"):  # A tensor, perhaps of a GPU or with half precision
+            values = radiance.detach().cpu()
+            values = values.double() if values.is_floating_point() else values
         dtype = np.asarray(values).dtype
         if dtype.kind != "f":
             remedy = "pass radiance as floats, such as response.decode(codes / 255) / exposure_time of a photo's codes"
@@ -224,6 +249,10 @@ class BracketWriter:
         radiance = np.asarray(values, np.float64)
         if radiance.shape[2:] != (3,) or not radiance.size:
             raise ValueError(f"radiance has shape {radiance.shape}, not [H, W, 3]")
+        if camera is not None and (camera.height, camera.width) != radiance.shape[:2]:
+            size = f"{radiance.shape[1]} x {radiance.shape[0]}"
+            problem = f"the camera of view {name} is {camera.width} x {camera.height}, its radiance {size}"
+            raise ValueError(f"{problem}; pass camera.resized(width, height)")
         check_finite(self.out / "brackets" / name, radiance, "{count} radiances")
         # One type for all exposures of a view, so that their ratios keep one precision.
         pixel = stored_pixel_type([from_rec709(radiance, self.header.colorspace) * self.exposures[-1].time], self.pixel)

@@ -5,6 +5,7 @@ grading.
 """
 
 import logging
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -169,9 +170,10 @@ def _check_options(cameras: Sequence[Camera], transfer: str, ev_ramp: tuple[floa
     for camera in cameras:
         require_camera(camera)
     if transfer not in TRANSFERS:
-        hint = did_you_mean(transfer, TRANSFERS)
+        hint = did_you_mean(str(transfer), TRANSFERS)
         raise SehdrError(f"transfer {transfer!r} is not one of {', '.join(TRANSFERS)}{hint}")
-    if np.shape(ev_ramp) != (2,) or not np.isfinite(ev_ramp).all():
+    numbers = [stops for stops in np.ravel(ev_ramp) if isinstance(stops, Real) and math.isfinite(stops)]
+    if np.shape(ev_ramp) != (2,) or len(numbers) != 2:
         raise SehdrError(f"ev_ramp {ev_ramp} is not two numbers of stops, of the first and the last frame")
 
 

@@ -52,6 +52,8 @@ def write_scene_page(
     """
     require_loaded("load_run", run)
     path = path_of(path, "path")
+    if not isinstance(edits, SplatEdits | None):
+        raise TypeError(f"edits is a {type(edits).__name__}, expected SplatEdits, such as SplatEdits(min_views=2)")
     check_absent(path, overwrite)
     opening = opening_facts(run)
     cameras = split_or_all(run, "train")

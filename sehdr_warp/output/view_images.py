@@ -99,6 +99,8 @@ def read_aovs(names: str | Sequence[str]) -> tuple[str, ...]:
     Raises:
         SehdrError: For an unknown or repeated name.
     """
+    if not isinstance(names, str | Sequence):
+        raise TypeError(f"aovs is {names!r:.60}, expected a list of names, or text with commas")
     requested = [name.strip() for name in names.split(",") if names] if isinstance(names, str) else list(names)
     for name in requested:
         if name not in AOVS and name != "all":

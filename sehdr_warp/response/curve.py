@@ -42,6 +42,10 @@ def _for_arrays(method: Callable[[Any, torch.Tensor], torch.Tensor]) -> _OfNumbe
         array = np.asarray(numbers)
         if array.dtype in (np.uint8, np.uint16):
             raise TypeError(f"a response takes floats, not {array.dtype}; divide codes by {np.iinfo(array.dtype).max}")
+        if array.dtype.kind not in "fiub":
+            raise TypeError(f"a response takes numbers, not {array.dtype}")
+        if array.dtype.kind in "iu" and method.__name__ == "decode" and array.max(initial=0) > 1:
+            raise TypeError(f"a response decodes values from 0 to 1, not {array.max()}; divide codes by 255")
         if array.dtype not in (np.float32, np.float64):
             array = array.astype(np.float32 if array.dtype == np.float16 else np.float64)
         # A copy: a negative stride or a read-only array is not a tensor.

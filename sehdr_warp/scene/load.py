@@ -185,7 +185,7 @@ def parse_dataset(
     """
     for name, value in {"holdout": holdout, "exposure_index": exposure_index}.items():
         if value is not None:
-            require_whole_number(value, name)
+            require_whole_number(value, name, 0)
     check_response_type(response)
     folder = _folder(path)
     dataset = read_video(folder, cache) if is_video(folder) else _read(folder, cameras)

@@ -201,7 +201,7 @@ def match_points(
     """
     require_loaded("load_scene", scene)
     require_whole_number(count, "count", 1)
-    require_whole_number(seed, "seed")
+    require_whole_number(seed, "seed", 0)
     if not isinstance(response, Response | None):
         raise TypeError(f"response is {response!r:.60}, expected a curve, as response_by_name() returns it")
     check_views(scene)

@@ -1,8 +1,11 @@
 """Arguments from Python of another kind than a function takes: the error names them, and nothing is written."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import sehdr_warp
 import sehdr_warp as sw
 
 
@@ -110,3 +113,77 @@ def test_compare_runs_takes_a_list(run):
     for value in (run, None, "runs/a"):
         with pytest.raises(TypeError, match="expected a list of runs, as load_run"):
             sw.compare_runs(value)
+
+
+PHOTOS = Path(sehdr_warp.__file__).parent / "embedded" / "room" / "train"
+PICTURE = np.ones((4, 6, 3), np.float32)
+
+
+def brackets(folder, views=None, **options):
+    return sw.write_brackets(folder / "x", {"a": PICTURE} if views is None else views, 1.0, **{"evs": [0]} | options)
+
+
+OPTIONS = {
+    "evs is 2, expected a list of stops, or text with commas": lambda run, to: brackets(to, evs=2),
+    "exposures is 0.5, expected a list": lambda run, to: brackets(to, evs=None, exposures=0.5),
+    "views is neither a dict of names": lambda run, to: brackets(to, {1: PICTURE}),
+    "views is neither a dict": lambda run, to: brackets(to, 5),
+    "views is empty; give the radiance of a view": lambda run, to: brackets(to, []),
+    "cameras is a list, expected a dict of names and Cameras": lambda run, to: brackets(to, cameras=[1]),
+    "camera is a str, expected a Camera": lambda run, to: brackets(to, cameras={"a": "a"}),
+    "cameras has 'b', which is not one of the views": lambda run, to: brackets(to, cameras={"b": photo(run)}),
+    "the camera of view a is .*, its radiance 6 x 4": lambda run, to: brackets(to, cameras={"a": photo(run)}),
+    "response is 'srgb', expected a curve": lambda run, to: brackets(to, ldr="png", response="srgb"),
+    "count is '3', expected a whole number": lambda run, to: sw.select_cameras(run, "orbit", count="3"),
+    "count is 1.5, expected a whole number": lambda run, to: sw.render_views(run, to / "x", cameras="orbit", count=1.5),
+    r"size \(64.5, 48\) is not usable": lambda run, to: sw.render_views(run, to / "x", size=(64.5, 48)),
+    "transform is a ndarray, expected what": lambda run, to: sw.select_cameras(run, "test", transform=np.eye(4)),
+    "aovs is None, expected a list of names": lambda run, to: sw.render_views(run, to / "x", aovs=None),
+    "color space None is not known": lambda run, to: sw.render_views(run, to / "x", colorspace=None),
+    "reference_white is '9', expected": lambda run, to: sw.render_views(run, to / "x", reference_white="9"),
+    "beyond is '1', expected a number": lambda run, to: sw.write_environment_map(run, to / "x.exr", beyond="1"),
+    "degree is '1', expected a whole number": lambda run, to: sw.export(run, to / "x.ply", degree="1"),
+    "degree is 1.5, expected a whole number": lambda run, to: sw.export(run, to / "x.ply", degree=1.5),
+    r"region \(0, 1\) is not box": lambda run, to: sw.SplatEdits(crop=(0, 1)),
+    "min_opacity is '0.5', expected a number": lambda run, to: sw.SplatEdits(min_opacity="0.5"),
+    "min_views is 1.5, expected a whole number": lambda run, to: sw.SplatEdits(min_views=1.5),
+    "max_gaussians is 1000.0, expected a whole": lambda run, to: sw.SplatEdits(max_gaussians=1e3),
+    "mask_views is 'photos', expected views": lambda run, to: sw.SplatEdits(mask_views="photos"),
+    r"mask_views is \(CameraEntry.*, expected views": lambda run, to: sw.SplatEdits(mask_views=run.cameras),
+    "resolution is '40', expected a whole": lambda run, to: sw.write_proxy_mesh(run, to / "x.obj", resolution="40"),
+    "edits is a str, expected SplatEdits": lambda run, to: sw.write_scene_page(run, to / "x.html", edits="crop"),
+    r"ev_ramp \('a', 'b'\) is not two numbers": lambda run, to: film(run, to, ev_ramp=("a", "b")),
+    "transfer None is not one of": lambda run, to: film(run, to, transfer=None),
+    r"times is 1.0, expected a list of seconds": lambda run, to: sw.calibrate(PHOTOS, times=1.0),
+    "time '1/2' is not seconds above 0": lambda run, to: sw.calibrate(PHOTOS, times=["1/2"]),
+    "time 0 is not seconds above 0; give": lambda run, to: sw.calibrate(PHOTOS, times=[0]),
+    "a response decodes values from 0 to 1, not 128": lambda run, to: run.response.decode(np.array([0, 128])),
+    "a response takes numbers, not object": lambda run, to: run.response.decode(None),
+    "a response takes numbers, not <U3": lambda run, to: run.response.encode("0.5"),
+}
+
+
+def photo(run):
+    return run.cameras[0].camera
+
+
+def film(run, to, **options):
+    return sw.write_film(run, to / "x.mp4", [photo(run)] * 2, **options)
+
+
+@pytest.mark.parametrize("words", OPTIONS)
+def test_options_of_outputs_that_cannot_be_are_named(run, tmp_path, words):
+    with pytest.raises((TypeError, ValueError, sw.SehdrError), match=words):
+        OPTIONS[words](run, tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+def test_options_of_a_report_that_cannot_be_are_named(run, scene, tmp_path):
+    for options, words in (
+        ({"view_count": "3"}, "view_count is '3', expected a whole number"),
+        ({"view_count": 0}, "view_count 0 is below 1"),
+        ({"evaluation": [1]}, "evaluation is a list, expected what evaluate"),
+    ):
+        with pytest.raises((TypeError, sw.SehdrError), match=words):
+            sw.write_report(run, scene, tmp_path / "x", **options)
+    assert not any(tmp_path.iterdir())

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...errors import SehdrError
+from ...errors import SehdrError, require_whole_number
 from ...scene import Camera
 from ...scene.camera_focus import camera_axes, camera_positions, common_focus
 from ...scene.gravity import looks_down, up_direction
@@ -154,6 +154,7 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
 def _check(cameras: Sequence[Camera], count: int) -> None:
     if not cameras:
         raise SehdrError("there are no training views, and a camera path follows theirs; give a file of cameras")
+    require_whole_number(count, "count")
     if not 1 <= count <= _LONGEST:
         raise SehdrError(f"a camera path cannot have {count} views; ask for a count of 1 to {_LONGEST}")
 

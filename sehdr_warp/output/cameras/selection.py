@@ -1,5 +1,6 @@
 """Choose the cameras of a render: views of a run, a path through the scene, or those of a file."""
 
+import operator
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -52,6 +53,8 @@ def select_cameras(
         SehdrError: If there are none, or `cameras` is neither a known name nor a file.
     """
     require_loaded("load_run", run)
+    if not isinstance(transform, WorldTransform | None):
+        raise TypeError(f"transform is a {type(transform).__name__}, expected what world_transform() returns")
     check_cameras(cameras)
     text = str(cameras)
     if not run.cameras and camera is None and text in SPLITS + PATHS:
@@ -130,7 +133,8 @@ def may_move(cameras: str | Path) -> bool:
 def read_size(size: str | tuple[int, int]) -> tuple[int, int]:
     """Return width and height in pixels from "1920x1080" or a pair; raise SehdrError for anything else."""
     try:
-        width, height = (int(side) for side in (size.lower().split("x") if isinstance(size, str) else size))
+        sides = size.lower().split("x") if isinstance(size, str) else size
+        width, height = (int(side) if isinstance(side, str) else operator.index(side) for side in sides)
     except (ValueError, TypeError):
         width = height = 0
     if min(width, height) < 1 or max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError, SehdrError, path_of, require_loaded
+from ...errors import InputError, SehdrError, path_of, require_loaded, require_whole_number
 from ...files import atomic_path
 from ...model.baking import field_of, fit_to_pictures, gaussians_of, psnr_of, with_photo_filters
 from ...response import response_by_name
@@ -179,6 +179,8 @@ def _check(path: Path, kind: str, file_model: str | None, exposure_time: float |
         raise SehdrError("an HDR file has no exposure time; leave it out, or write kind ldr")
     if exposure_time is not None and not (isinstance(exposure_time, Real) and 0 < exposure_time < math.inf):
         raise SehdrError(f"exposure time {exposure_time!r:.60} is not positive and finite; give seconds")
+    if degree is not None:
+        require_whole_number(degree, "degree")
     if degree is not None and not 0 <= degree <= 3:
         raise SehdrError(f"harmonics of degree {degree} are not supported; give 0 to 3")
 

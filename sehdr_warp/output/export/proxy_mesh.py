@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...errors import InputError, SehdrError, path_of, require_loaded
+from ...errors import InputError, SehdrError, path_of, require_loaded, require_whole_number
 from ...files import atomic_path, check_absent
 from ...progress import track_progress
 from ...runs.run import RenderableScene
@@ -145,6 +145,7 @@ def check_mesh(path: Path | str, resolution: int, crop: str | None, overwrite: b
     if path.suffix.lower() not in SUFFIXES:
         kind = path.suffix or "a file without a suffix"
         raise InputError(path, f"a mesh is not written as {kind}", f"use one of {', '.join(SUFFIXES)}")
+    require_whole_number(resolution, "resolution")
     if not RESOLUTIONS[0] <= resolution <= RESOLUTIONS[1]:
         raise SehdrError(f"resolution {resolution} is not between {RESOLUTIONS[0]} and {RESOLUTIONS[1]} voxels")
     region = None if crop is None else read_region(crop)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...errors import SehdrError
+from ...errors import SehdrError, require_number, require_whole_number
 from ...model.visibility import contributions, count_views, mask_shares
 from ...runs.run import RenderableScene
 from ...scene import Camera, View
@@ -55,7 +55,7 @@ def read_region(text: str) -> Box | Sphere:
     Raises:
         SehdrError: If it is neither, or is empty.
     """
-    kind, _, numbers = text.partition(":")
+    kind, _, numbers = text.partition(":") if isinstance(text, str) else ("", "", "")
     try:
         values = np.array([float(number) for number in numbers.split(",")])
     except ValueError:
@@ -89,15 +89,21 @@ class SplatEdits:
     mask_views: Sequence[View] | None = None
 
     def __post_init__(self):
-        """Raise SehdrError for values that cannot be."""
-        for region in filter(None, (self.crop, self.cut)):
-            read_region(region)
+        """Raise SehdrError for values that cannot be, and TypeError for those of another type."""
+        for region in (self.crop, self.cut):
+            if region not in (None, ""):
+                read_region(region)
+        require_number(self.min_opacity, "min_opacity")
+        require_whole_number(self.min_views, "min_views")
         if not 0 <= self.min_opacity < 1:
             raise SehdrError(f"min_opacity {self.min_opacity} is not at least 0 and below 1")
         if self.min_views < 0:
             raise SehdrError(f"min_views {self.min_views} is negative; 2 leaves out what a single camera shows")
-        if self.max_gaussians is not None and self.max_gaussians < 1:
-            raise SehdrError(f"max_gaussians {self.max_gaussians} leaves nothing; give 1 or more")
+        if self.max_gaussians is not None:
+            require_whole_number(self.max_gaussians, "max_gaussians", 1)
+        views = () if self.mask_views is None else self.mask_views
+        if not (isinstance(views, Sequence) and all(isinstance(view, View) for view in views)):
+            raise TypeError(f"mask_views is {self.mask_views!r:.60}, expected views of a scene, as scene.views")
         if self.mask_views is not None and all(painted_mask(view) is None for view in self.mask_views):
             remedy = "paint masks/PHOTO.png beside the photos, white where the object is"
             raise SehdrError(f"no photo has a mask that leaves out pixels; {remedy}")

@@ -37,7 +37,7 @@ def color_space(name: str) -> ColorSpace:
     Raises:
         SehdrError: For an unknown name.
     """
-    key = name.strip().lower()
+    key = str(name).strip().lower()
     if key == "srgb":
         raise SehdrError("color space 'srgb' is an encoding, and files hold linear light; rec709 has its primaries")
     for space in SPACES:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...errors import SehdrError
+from ...errors import SehdrError, require_number
 from ...scene.color.primaries import linear_to_srgb
 
 if TYPE_CHECKING:
@@ -45,6 +45,8 @@ def exposure_for_white(run: "RenderableScene", white: float | None) -> float:
     Raises:
         SehdrError: For a white outside 0.001 to 10000.
     """
+    if white is not None:
+        require_number(white, "reference_white")
     exposure = 1.0 if white is None else white * run.base_time * display_gain(run.response)
     if not (math.isfinite(exposure) and exposure > 0 and (white is None or 1e-3 <= white <= 1e4)):
         raise SehdrError(f"reference white {white} is not between 0.001 and 10000; 1 shows the photos' white as 1")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...errors import SehdrError
+from ...errors import SehdrError, require_number
 from ...scene.camera_focus import MapCenter, map_center
 from ..cameras.scene_cameras import find_view, training_cameras
 from ..world_transform import WorldTransform
@@ -50,6 +50,8 @@ def _numbers(at: str | tuple[float, float, float]) -> np.ndarray:
 
 def check_beyond(beyond: float | None) -> None:
     """Raise SehdrError for a distance that is negative or not finite."""
+    if beyond is not None:
+        require_number(beyond, "beyond")
     if beyond is not None and not 0 <= beyond < np.inf:
         raise SehdrError(f"beyond {beyond:g} is not a distance; give 0 or more, in the units of exported files")
 

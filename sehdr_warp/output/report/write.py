@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, SehdrError, path_of, require_loaded
+from ...errors import InputError, SehdrError, path_of, require_loaded, require_whole_number
 from ...files import atomic_path, check_absent
 from ...own_files import first_unlisted
 from ...progress import track_progress
@@ -73,6 +73,9 @@ def write_report(
     require_loaded("load_run", run)
     require_loaded("load_scene", scene)
     out = path_of(out, "out")
+    require_whole_number(view_count, "view_count", 1)
+    if not isinstance(evaluation, Mapping | None):
+        raise TypeError(f"evaluation is a {type(evaluation).__name__}, expected what evaluate() returns")
     check_report_folder(out)
     metrics = run.metrics()
     charted = any(training_points(metrics, key) for key in PANELS)
@@ -84,7 +87,7 @@ def write_report(
     candidates, held_out = scene.test_views or scene.train_views, bool(scene.test_views)
     if not candidates:
         raise SehdrError("the scene has no views to report on; check its splits")
-    views = evenly(candidates, max(view_count, 1))
+    views = evenly(candidates, view_count)
     aligned = (evaluation or {}).get("protocol", {}).get("aligned") or {}
     scale = aligned.get("scale") or 1.0  # Photos tell radiance up to a factor if their times or curve are not known.
     comparisons = [compare(run, view, scene.views, scale) for _, view in track_progress("comparing views", views, log)]

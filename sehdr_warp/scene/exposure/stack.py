@@ -3,8 +3,9 @@
 import logging
 import math
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise, starmap
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,6 +54,12 @@ def read_stack(folder: Path, times: Sequence[float] | None = None) -> tuple[list
         for note in notes:
             log.info(note)
         times = [record.seconds for record in records]
+    if isinstance(times, str) or not isinstance(times, Iterable):
+        raise TypeError(f"times is {times!r:.60}, expected a list of seconds")
+    times = list(times)
+    for time in times:
+        if not (isinstance(time, Real) and 0 < time < math.inf):
+            raise InputError(folder, f"time {time!r:.40} is not seconds above 0", "give numbers, such as 1 / 125")
     if len(times) != len(files):
         raise InputError(folder, f"has {len(files)} photos, and {len(times)} times are given", "give one for each")
     return files, times
