@@ -186,7 +186,12 @@ def differentiable(body: Callable[..., Any]) -> Callable[..., Any]:
 
     Args:
         body: body(program, *tensors, **options) -> tensors made by program.empty_output().
+
+    Raises:
+        TypeError: for what is not a function.
     """
+    if not callable(body):
+        raise TypeError(f"@differentiable takes a function of a program, not {body!r:.60}")
 
     @torch_operation
     @wraps(body)

@@ -154,10 +154,20 @@ def check_directions(directions: Tensor) -> None:
     """Raise ValueError for directions [..., 3] that require a gradient, or on the CPU are not finite unit vectors."""
     if directions.requires_grad and torch.is_grad_enabled():
         raise ValueError("directions requires a gradient, which is not computed; pass directions.detach()")
-    if directions.device.type == "cpu":
-        low, high = (float(length) for length in directions.detach().norm(dim=-1).aminmax())
+    check_unit_vectors("directions", directions)
+
+
+def check_unit_vectors(name: str, vectors: Tensor) -> None:
+    """Raise ValueError for vectors [..., 3], at least one, on the CPU that are not finite and of length 1."""
+    if vectors.device.type == "cpu":
+        low, high = (float(length) for length in vectors.detach().norm(dim=-1).aminmax())
         if not (low > 0.99 and high < 1.01):
-            raise ValueError(f"directions have lengths from {low:g} to {high:g}, expected unit vectors")
+            raise ValueError(f"{name} have lengths from {low:g} to {high:g}, expected unit vectors")
+
+
+def is_angle(number: float) -> bool:
+    """Return whether a number can be the angle of a pixel, in radians."""
+    return 0.0 <= number <= 2 * math.pi
 
 
 def check_cameras(world_to_camera: Tensor, intrinsics: Tensor) -> None:

@@ -16,7 +16,8 @@ from .checks import (
     check_position,
     check_render_options,
     check_tensors,
-    is_not_negative,
+    check_unit_vectors,
+    is_angle,
     is_positive,
     real,
 )
@@ -92,11 +93,12 @@ def rasterize_directions(
         check_tensors(means=(means, ("N", 3)), axes=(axes, ("A", 3)))
         if not len(axes):
             raise ValueError(f"axes has shape {list(axes.shape)}, expected [A, 3] with at least one axis")
+        check_unit_vectors("axes", axes)
     check_channels(features)
     check_opacities(opacities)
     check_position(position)
     real("focal_length", focal_length, is_positive, "a positive number")
-    real("pixel_angle", pixel_angle, is_not_negative, "a number from 0")
+    real("pixel_angle", pixel_angle, is_angle, "radians from 0 to 2 pi")
     check_render_options(near_plane, alpha_threshold)
     antialiased = boolean("antialiased", antialiased)
     height, width = directions.shape[:2]

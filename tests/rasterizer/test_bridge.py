@@ -148,3 +148,9 @@ def test_runs_on_a_side_stream():
         scaled, _ = scale_and_square(moved.nan_to_num(), gain)
     torch.cuda.synchronize()
     torch.testing.assert_close(scaled, 2.0 * gain * values)
+
+
+@pytest.mark.parametrize("body", [None, 5, torch.ones(3)])
+def test_what_is_no_function_is_no_program(body):
+    with pytest.raises(TypeError, match="@differentiable takes a function of a program, not"):
+        differentiable(body)

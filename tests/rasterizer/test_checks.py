@@ -85,7 +85,8 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
     [
         ("focal_length", 0.0, ValueError, "focal_length 0.0 is not a positive number"),
         ("focal_length", "60", TypeError, "focal_length is '60', expected a number"),
-        ("pixel_angle", NAN, ValueError, "pixel_angle nan is not a number from 0"),
+        ("pixel_angle", NAN, ValueError, "pixel_angle nan is not radians from 0 to 2 pi"),
+        ("pixel_angle", 45.0, ValueError, "pixel_angle 45.0 is not radians from 0 to 2 pi"),
         ("near_plane", -1.0, ValueError, "near_plane -1.0 is not a positive number"),
         ("alpha_threshold", 1.0, ValueError, "alpha_threshold 1.0 is not between 1e-37 and 1"),
         ("antialiased", None, TypeError, "antialiased is None, expected True or False"),
@@ -104,6 +105,8 @@ def test_misfits_of_a_render_are_named(name, change, kind, message):
         ("directions", torch.full((2, 2, 3), NAN).double(), ValueError, "directions have lengths from nan to nan"),
         ("axes", torch.eye(3).double()[0], ValueError, r"axes has shape \[3\], expected \[A, 3\]"),
         ("axes", torch.zeros(0, 3).double(), ValueError, r"axes has shape \[0, 3\], expected .* at least one axis"),
+        ("axes", torch.zeros(2, 3).double(), ValueError, "axes have lengths from 0 to 0, expected unit vectors"),
+        ("axes", torch.eye(3).double() * 2, ValueError, "axes have lengths from 2 to 2, expected unit vectors"),
         ("directions", torch.eye(3).double()[None].requires_grad_(), ValueError, r"pass directions\.detach\(\)"),
         (
             "features",
