@@ -189,7 +189,7 @@ def read_json(path: Path, limit: int = MAX_JSON_BYTES) -> dict:
     """Return the JSON object in a file; raise InputError if it is missing, too large, broken or not an object."""
     text = read_text(path, limit)
     try:
-        values = json.loads(text, object_pairs_hook=_unique)
+        values = json.loads(text, object_pairs_hook=unique_keys)
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not valid JSON ({error})", "export the file again") from None
     if not isinstance(values, dict):
@@ -197,7 +197,8 @@ def read_json(path: Path, limit: int = MAX_JSON_BYTES) -> dict:
     return values
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict:
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict:
+    """Return an object of JSON by its pairs; raise ValueError for a key that stands twice."""
     values = dict(pairs)
     if len(values) < len(pairs):
         twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from statistics import median
 
 from ...errors import InputError
-from ...files import has_file, read_bytes
+from ...files import has_file, read_bytes, unique_keys
 from ...json_values import damage, json_object, shown, text
 from ...subsets import counted, first_names
 from ..dataparser import ImageRecord
@@ -195,10 +195,10 @@ def _unread_lists(places: Iterable[Path]) -> list[str]:
 
 def _read_times(path: Path) -> Mapping[str, float]:
     try:
-        values = json.loads(read_bytes(path, 1 << 24))
+        values = json.loads(read_bytes(path, 1 << 24), object_pairs_hook=unique_keys)
         if isinstance(values, list):
             listed = [json_object(entry, f"entry {place}") for place, entry in enumerate(values)]
-            values = {text(entry, "file"): entry["exposure_time"] for entry in listed}
+            values = unique_keys([(text(entry, "file"), entry["exposure_time"]) for entry in listed])
         entries = json_object(values, "it").items()
     except (ValueError, RecursionError, KeyError) as error:
         problem = f"is not a table of exposure times ({damage(error)})"

@@ -1,6 +1,7 @@
 """Exposure times: units, sets that differ in ISO alone, and times that EXIF contradicts."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -162,6 +163,25 @@ def test_one_photo_without_time_does_not_stop_a_set_and_a_list_helps(tmp_path):
         (tmp_path / "exposures.json").write_text(wrong)
         with pytest.raises(InputError, match=r"exposures\.json|exposure time"):
             load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "table, words",
+    [
+        ("[1, 2]", "is not a table of exposure times (entry 0 is 1, not an object)"),
+        ('"x"', "is not a table of exposure times (it is 'x', not an object)"),
+        ("null", "is not a table of exposure times (it is null, not an object)"),
+        ('[{"file": "000.jpg"}]', "is not a table of exposure times (exposure_time is missing)"),
+        ('[{"file": [], "exposure_time": 1}]', "(file is a list of 0, not a text)"),
+        ('{"000.jpg": 1, "000.jpg": 2}', "(the key '000.jpg' stands twice)"),
+        ('[{"file": "0", "exposure_time": 1}, {"file": "0", "exposure_time": 2}]', "(the key '0' stands twice)"),
+    ],
+)
+def test_a_table_that_is_none_is_named_with_what_is_wrong(tmp_path, table, words):
+    write_colmap(tmp_path, name="{:03d}.jpg")
+    (tmp_path / "exposures.json").write_text(table)
+    with pytest.raises(InputError, match=re.escape(words)):
+        load(tmp_path)
 
 
 def test_listed_times_of_no_photo_are_named(tmp_path):
