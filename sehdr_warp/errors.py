@@ -98,8 +98,19 @@ _LOADED = {"load_scene": "train_views", "load_run": "render"}
 """An attribute of what each function returns, by which other values are told from it."""
 
 
+def require_trained(*values: object) -> None:
+    """Raise TypeError for what is not a run of load_run(), such as a file of Gaussians or merged scenes."""
+    require_loaded("load_run", *values)
+    for value in values:
+        if not hasattr(value, "train_seconds"):
+            raise TypeError(f"{type(value).__name__} has no training, expected what sehdr_warp.load_run() returns")
+
+
 def require_loaded(loader: str, *values: object) -> None:
-    """Raise TypeError for a path, a list or another value in place of what `loader`() reads from a path."""
+    """Raise TypeError for a path, a list or another value in place of what `loader`() reads from a path.
+
+    Files of Gaussians and merged scenes are taken for runs; see require_trained().
+    """
     for value in values:
         if isinstance(value, list | tuple):
             raise TypeError(

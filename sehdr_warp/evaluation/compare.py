@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SehdrError, require_loaded
+from ..errors import SehdrError, require_trained
 
 if TYPE_CHECKING:
     from ..runs.run import Run
@@ -66,7 +66,7 @@ def compare_runs(runs: "Sequence[Run]") -> list[ComparedRuns]:
     if isinstance(runs, str) or not isinstance(runs, Iterable):
         raise TypeError(f"runs is {runs!r:.60}, expected a list of runs, as load_run() returns them")
     runs = list(runs)
-    require_loaded("load_run", *runs)
+    require_trained(*runs)
     if not runs:
         raise SehdrError("compare: no runs; name their folders")
     groups: dict[str, list] = {}

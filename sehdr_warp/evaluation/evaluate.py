@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import SehdrError, require_loaded
+from ..errors import SehdrError, require_loaded, require_trained
 from ..runs.run import Run
+from ..runs.scene_description import warn_of_other_cameras
 from ..scene import Scene, View
 from . import metrics
 from .lights import LightRegion, count_lights, light_regions
@@ -72,8 +73,9 @@ def evaluate(run: Run, scene: Scene, *, lpips_weights: Path | str | None = None)
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    require_loaded("load_run", run)
+    require_trained(run)
     require_loaded("load_scene", scene)
+    warn_of_other_cameras(run, scene)
     return Evaluation(_run_predictions(run), run.normalize_photos(scene), run.device, lpips_weights).result()
 
 

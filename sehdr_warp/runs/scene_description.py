@@ -6,10 +6,11 @@ That of a masked photo has a second part, of the mask.
 """
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,11 +20,13 @@ from ..scene.photo_names import photo_labels
 from ..subsets import first_names
 from .values import FORMAT
 
+log = logging.getLogger(__name__)
 GRID = 8
 _MOST_ROWS = 32  # Rows that are read of each row of cells; more would take longer for large photos and find little more
 SFM_LAYOUTS = "photos", "video"  # Layouts of sets whose cameras structure from motion finds
 # Cameras that differ less than this count as the same: 0.25 degrees, and parts of the cameras' radius and focal length.
 _LEAST_COSINE, _MOST_MOVED, _MOST_ZOOMED = 0.99999, 0.01, 0.005
+_SAME_POSE = 0.02  # Of its largest number: difference that structure from motion leaves in a pose
 _TOLERANCE = 2  # Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded
 
 
@@ -42,6 +45,15 @@ def describe_scene(scene: Scene) -> dict:
     ]
     facts = {"exposure_times_known": scene.exposure_times_known, "notes": list(scene.notes)}
     return {"format": FORMAT, "name": scene.name, "layout": scene.format, **facts, "views": views}
+
+
+def warn_of_other_cameras(run: Any, scene: Scene) -> None:
+    """Log a warning if no view of a scene has the camera that the run has for its name: the world may be another."""
+    poses = {entry.name: entry.camera.world_to_camera for entry in run.cameras}
+    pairs = [(poses[view.name], view.camera.world_to_camera) for view in scene.views if view.name in poses]
+    if poses and not any(np.allclose(*pair, rtol=0, atol=_SAME_POSE * max(1, np.abs(pair[0]).max())) for pair in pairs):
+        problem = "no camera is that of the run's view of its name, so the scene may be another one than the run's"
+        log.warning("%s: %s; load the photos that the run was trained on", scene.name, problem)
 
 
 def _lens_values(view: View, label: str) -> dict:

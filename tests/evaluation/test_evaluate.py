@@ -47,7 +47,7 @@ def run(change=lambda hdr: hdr):
 
     numbers = {"train_seconds": 12.5, "gaussian_count": 4321, "iterations": 700}
     sure = {"response": RESPONSE, "render_confidence": lambda camera: None, "normalize_photos": lambda scene: scene}
-    return SimpleNamespace(render=render, render_ldr=render_ldr, device="cpu", **sure, **numbers)
+    return SimpleNamespace(render=render, render_ldr=render_ldr, device="cpu", cameras=(), **sure, **numbers)
 
 
 @pytest.fixture(autouse=True)

@@ -1,5 +1,6 @@
 """Arguments from Python of another kind than a function takes: the error names them, and nothing is written."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -187,3 +188,23 @@ def test_options_of_a_report_that_cannot_be_are_named(run, scene, tmp_path):
         with pytest.raises((TypeError, sw.SehdrError), match=words):
             sw.write_report(run, scene, tmp_path / "x", **options)
     assert not any(tmp_path.iterdir())
+
+
+def test_what_was_not_trained_is_named(run, scene, tmp_path):
+    splats = sw.load_splats(sw.export(run, tmp_path / "scene.ply"))
+    for value, kind in ((splats, "Splats"), (sw.merge_scenes(run), "MergedScene")):
+        for call in (
+            lambda value=value: sw.evaluate(value, scene),
+            lambda value=value: sw.compare_runs([value]),
+            lambda value=value: sw.write_report(value, scene, tmp_path / "x"),
+        ):
+            with pytest.raises(TypeError, match=rf"{kind} has no training, expected what sehdr_warp.load_run\(\)"):
+                call()
+
+
+def test_a_scene_of_other_cameras_is_named(run, scene, tmp_path, logged):
+    sw.evaluate(run, scene)
+    assert not any("no camera is that of the run" in line for line in logged)
+    turned = [replace(view, camera=scene.views[index - 1].camera) for index, view in enumerate(scene.views)]
+    sw.evaluate(run, replace(scene, views=tuple(turned)))
+    assert any("no camera is that of the run's view of its name" in line for line in logged)

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, SehdrError, path_of, require_loaded, require_whole_number
+from ...errors import InputError, SehdrError, path_of, require_loaded, require_trained, require_whole_number
 from ...files import atomic_path, check_absent
 from ...own_files import first_unlisted
 from ...progress import track_progress
 from ...runs.run import Run
+from ...runs.scene_description import warn_of_other_cameras
 from ...scene import Scene, View
 from ...scene.exposure.times import shutter
 from ...scene.images.ldr_files import LDR_SUFFIXES, RAW_SUFFIXES
@@ -70,8 +71,9 @@ def write_report(
         InputError: If a file exists, or the folder holds photos.
         SehdrError: For a scene without views.
     """
-    require_loaded("load_run", run)
+    require_trained(run)
     require_loaded("load_scene", scene)
+    warn_of_other_cameras(run, scene)
     out = path_of(out, "out")
     require_whole_number(view_count, "view_count", 1)
     if not isinstance(evaluation, Mapping | None):
