@@ -63,10 +63,10 @@ def compare_runs(runs: "Sequence[Run]") -> list[ComparedRuns]:
     Raises:
         SehdrError: without runs, for a run that is named twice, or one without evaluations in its metrics.
     """
-    if isinstance(runs, str) or not isinstance(runs, Iterable):
+    if not isinstance(runs, str | Iterable):
         raise TypeError(f"runs is {runs!r:.60}, expected a list of runs, as load_run() returns them")
+    require_trained(*([runs] if isinstance(runs, str) else runs))
     runs = list(runs)
-    require_trained(*runs)
     if not runs:
         raise SehdrError("compare: no runs; name their folders")
     groups: dict[str, list] = {}

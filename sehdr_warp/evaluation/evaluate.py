@@ -73,8 +73,8 @@ def evaluate(run: Run, scene: Scene, *, lpips_weights: Path | str | None = None)
         SehdrError: for a scene without views, images that disagree with their camera or a render that is not finite.
         InputError: for LPIPS weights that cannot be read.
     """
-    require_trained(run)
     require_loaded("load_scene", scene)
+    require_trained(run)
     warn_of_other_cameras(run, scene)
     return Evaluation(_run_predictions(run), run.normalize_photos(scene), run.device, lpips_weights).result()
 

@@ -10,6 +10,7 @@ import tomllib
 from dataclasses import fields, is_dataclass
 from importlib import resources
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -53,10 +54,11 @@ def test_a_path_in_place_of_a_run_or_scene_names_what_reads_it(name):
     function = getattr(sehdr_warp, name)
     parameters = {} if inspect.isclass(function) else inspect.signature(function).parameters
     needed = {each.name for each in parameters.values() if each.default is each.empty and each.kind <= 1}
-    for parameter, loader in {"run": "run", "runs": "run", "scene": "scene", "truth": "scene"}.items():
-        if parameter in parameters:
-            with pytest.raises(TypeError, match=rf"'a/path' is a path.*load_{loader}\(\)"):
-                function(**dict.fromkeys(needed) | {parameter: "a/path"})
+    loaders = {"run": "run", "runs": "run", "scene": "scene", "truth": "scene"}
+    both = SimpleNamespace(train_views=(), render=None, train_seconds=0.0)  # A run and a scene as far as is looked at
+    for parameter in loaders.keys() & parameters.keys():
+        with pytest.raises(TypeError, match=rf"'a/path' is a path.*load_{loaders[parameter]}\(\)"):
+            function(**{name: both if name in loaders else None for name in needed} | {parameter: "a/path"})
 
 
 def test_type_checkers_see_every_public_name():

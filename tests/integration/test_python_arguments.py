@@ -48,13 +48,13 @@ def test_a_path_that_is_none_is_named(run, scene, name, path):
 
 
 RUNS = {
-    "render_views": lambda value, folder: sw.render_views(value, folder / "x"),
-    "export": lambda value, folder: sw.export(value, folder / "x.ply"),
-    "write_environment_map": lambda value, folder: sw.write_environment_map(value, folder / "x.exr"),
-    "write_report": lambda value, folder: sw.write_report(value, value, folder / "x"),
-    "evaluate": lambda value, folder: sw.evaluate(value, value),
-    "select_cameras": lambda value, folder: sw.select_cameras(value, "orbit"),
-    "merge_scenes": lambda value, folder: sw.merge_scenes(value),
+    "render_views": lambda value, scene, folder: sw.render_views(value, folder / "x"),
+    "export": lambda value, scene, folder: sw.export(value, folder / "x.ply"),
+    "write_environment_map": lambda value, scene, folder: sw.write_environment_map(value, folder / "x.exr"),
+    "write_report": lambda value, scene, folder: sw.write_report(value, scene, folder / "x"),
+    "evaluate": lambda value, scene, folder: sw.evaluate(value, scene),
+    "select_cameras": lambda value, scene, folder: sw.select_cameras(value, "orbit"),
+    "merge_scenes": lambda value, scene, folder: sw.merge_scenes(value),
 }
 
 
@@ -62,7 +62,7 @@ RUNS = {
 def test_a_scene_in_place_of_a_run_is_named(scene, tmp_path, name):
     for value, kind in ((scene, "Scene"), (None, "NoneType")):
         with pytest.raises(TypeError, match=rf"a {kind} is not what sehdr_warp.load_run\(\) returns"):
-            RUNS[name](value, tmp_path)
+            RUNS[name](value, scene, tmp_path)
     assert not any(tmp_path.iterdir())
 
 
@@ -111,7 +111,7 @@ def test_options_of_load_scene_that_cannot_be_are_named(options, words):
 
 
 def test_compare_runs_takes_a_list(run):
-    for value in (run, None, "runs/a"):
+    for value in (run, None):
         with pytest.raises(TypeError, match="expected a list of runs, as load_run"):
             sw.compare_runs(value)
 

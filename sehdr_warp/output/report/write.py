@@ -71,8 +71,8 @@ def write_report(
         InputError: If a file exists, or the folder holds photos.
         SehdrError: For a scene without views.
     """
-    require_trained(run)
     require_loaded("load_scene", scene)
+    require_trained(run)
     warn_of_other_cameras(run, scene)
     out = path_of(out, "out")
     require_whole_number(view_count, "view_count", 1)
