@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import InputError
+from ..json_values import numbers
 from ..scene import Camera, Scene, View
 from ..scene.photo_names import photo_labels
 from ..subsets import first_names
@@ -26,6 +27,7 @@ _MOST_ROWS = 32  # Rows that are read of each row of cells; more would take long
 SFM_LAYOUTS = "photos", "video"  # Layouts of sets whose cameras structure from motion finds
 # Cameras that differ less than this count as the same: 0.25 degrees, and parts of the cameras' radius and focal length.
 _LEAST_COSINE, _MOST_MOVED, _MOST_ZOOMED = 0.99999, 0.01, 0.005
+_ROUNDING = 1e-12  # Difference of poses, of positions in parts of the largest coordinate
 _SAME_POSE = 0.02  # Of its largest number: difference that structure from motion leaves in a pose
 _TOLERANCE = 2  # Codes of 255 that a cell may differ by: decoders differ by one, and the mean is rounded
 
@@ -84,11 +86,25 @@ def scene_difference(saved: dict, current: dict) -> SceneDifference | None:
         for view in (*saved["views"], *current["views"]):
             for name in ("fx", "fy", "cx", "cy"):
                 view["camera"].pop(name, None)
+    for old, new in zip(saved["views"], current["views"], strict=False):
+        if _are_one_camera(old["camera"], new["camera"]):
+            new["camera"] = old["camera"]
     if saved["views"] != current["views"]:
         return SceneDifference(_differing_part(saved["views"], current["views"]), False)
     if changed := changed_photos(photos, current_photos):
         return SceneDifference(f"{changed[0]} and {len(changed) - 1} more" if len(changed) > 1 else changed[0], True)
     return None
+
+
+def _are_one_camera(one: dict, other: dict) -> bool:
+    """Return whether descriptions of cameras differ by rounding alone, as processors invert matrices."""
+    rests = [{name: value for name, value in camera.items() if name != "world_to_camera"} for camera in (one, other)]
+    try:
+        old, new = (numbers(camera, "world_to_camera", 4, 4) for camera in (one, other))
+    except (KeyError, ValueError):  # A damaged run
+        return False
+    near = np.abs(old - new) <= _ROUNDING * np.maximum(1, np.abs(old[:3, 3]).max() * (np.arange(4) == 3))
+    return rests[0] == rests[1] and bool(near.all())
 
 
 def _differing_part(saved: list[dict], current: list[dict]) -> str:

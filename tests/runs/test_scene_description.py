@@ -8,7 +8,13 @@ import pytest
 
 from sehdr_warp.errors import InputError
 from sehdr_warp.runs.run_folder import RunFolder
-from sehdr_warp.runs.scene_description import changed_photos, describe_scene, in_world_of_run, photo_signature
+from sehdr_warp.runs.scene_description import (
+    changed_photos,
+    describe_scene,
+    in_world_of_run,
+    photo_signature,
+    scene_difference,
+)
 from sehdr_warp.scene.lens import Lens
 
 from ..found_cameras import TURN, in_other_world
@@ -23,6 +29,24 @@ def test_photos_of_one_name_in_several_folders_stay_apart():
     views = [replace(v, source=Path("DCIM", f), lens=lens) for v, f in zip(scene.views, files, strict=True)]
     described = describe_scene(replace(scene, views=tuple(views), format="photos"))
     assert [view["lens"]["file"] for view in described["views"]] == [*files]
+
+
+def test_cameras_that_differ_by_rounding_are_the_same():
+    """Processors invert matrices with other last digits, and a run is resumed on another machine."""
+    scene = toy_scene(3, 8)
+    saved = describe_scene(scene)
+
+    def moved(part):
+        first, *others = scene.views
+        pose = first.camera.world_to_camera.copy()
+        pose[:3, 3] *= 1 + part
+        view = replace(first, camera=replace(first.camera, world_to_camera=pose))
+        return describe_scene(replace(scene, views=(view, *others)))
+
+    assert moved(1e-15) != saved and scene_difference(saved, moved(1e-15)) is None
+    assert scene_difference(saved, moved(1e-9)).what == "cameras"
+    del saved["views"][0]["camera"]["world_to_camera"]
+    assert scene_difference(saved, describe_scene(scene)).what == "cameras"
 
 
 def test_a_world_that_is_turned_moved_and_scaled_as_a_whole_gets_the_poses_of_the_run():
