@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -21,7 +21,7 @@ from .dataparser import DataparserOutputs, ImageRecord, reinhard_gamma
 from .float_photos import float_codes
 from .images.downsampling import area_average
 from .images.gain_map import gain_map_notes, light_of, read_gain_map, with_light_above_white
-from .images.hdr_files import hdr_size, read_hdr, read_light
+from .images.hdr_files import Light, hdr_size, read_hdr, read_light
 from .images.ldr_files import EncodedImage, file_kind, with_whole_white
 from .lens import Lens, Undistortion
 from .masks import mask_note, read_mask
@@ -120,14 +120,22 @@ def _cropped_note(cropped: Mapping[Path, float], dataset: DataparserOutputs) -> 
 
 def read_codes(record: ImageRecord) -> EncodedImage:
     """Read a photo's codes, or compute them from HDR truth or light, before anything is undistorted or resized."""
-    photo, encoding = _read_stored(record, {}, oriented=False)
-    return encoding.convert(photo)
+    stored = _read_stored(record, {}, oriented=False)
+    return stored.encoding.convert(stored.photo)
+
+
+class _StoredPhoto(NamedTuple):
+    """A photo as its file stores it."""
+
+    photo: EncodedImage  # Codes before they are converted to sRGB's
+    encoding: ColorEncoding  # Of the codes
+    is_transparent: bool  # Whether the file has transparent parts; the photo has alpha only if they are not black yet
 
 
 def _read_stored(
     record: ImageRecord, problems: dict[Path, str], *, oriented: bool, masked: bool = False
-) -> tuple[EncodedImage, ColorEncoding]:
-    """Return a photo before its codes are converted to sRGB's, and their encoding.
+) -> _StoredPhoto:
+    """Return a photo before its codes are converted to sRGB's.
 
     The problem of a damaged gain map goes to `problems`. `masked` leaves float pictures without the black that their
     transparent parts lie over.
@@ -135,12 +143,13 @@ def _read_stored(
     srgb, kind = ColorEncoding("sRGB"), file_kind(record.image)
     if record.derived:
         codes = codes_of(reinhard_gamma(read_hdr(record.image) * record.seconds), 8)
-        return EncodedImage(codes, None), srgb
+        return _StoredPhoto(EncodedImage(codes, None), srgb, False)
     if kind == "float":
         light = read_light(record.image)
         pixels = light.uncovered if masked else light.pixels
         codes = float_codes(pixels * record.light_scale, record.seconds)
-        return EncodedImage(codes, light.coverage if masked else None), srgb
+        photo = EncodedImage(codes, light.coverage if masked else None)
+        return _StoredPhoto(photo, srgb, light.coverage is not None)
     photo, encoding = read_photo(record.image, oriented=oriented), record.encoding or srgb
     if kind == "encoded" and not record.linear:
         gain_map = read_gain_map(record.image, oriented=oriented, problems=problems)
@@ -152,7 +161,7 @@ def _read_stored(
     elif record.linear and encoding.light is None:
         photo = EncodedImage(linear_codes(photo.pixels / photo.levels), photo.alpha)
         encoding = replace(encoding, curves=(), table=None)
-    return photo, encoding
+    return _StoredPhoto(photo, encoding, photo.alpha is not None)
 
 
 @dataclass(frozen=True)
@@ -207,7 +216,7 @@ class _Preprocessor:
         lens, oriented = (record.lens, False) if record.derived else fitted_lens(record)
         resample = self._resampler(record, lens)
         camera = resample.camera
-        hdr = self._truth(record, lens, resample)
+        hdr = self._truth(record, name, lens, resample)
         if hdr is not None and record.is_own_truth:
             hdr *= np.float32(record.light_scale)
         time, split = record.seconds, record.split or "train"
@@ -217,18 +226,17 @@ class _Preprocessor:
             mask = _by_solid_angle(None if stored is None else resample(stored), camera)
             codes = codes_of(reinhard_gamma(hdr * time), 8)
             return View(name, codes, camera, time, split, mask, hdr, record.image)
-        photo, encoding = _read_stored(record, self.gain_map_problems, oriented=oriented, masked=self.alpha == "mask")
+        masked = self.alpha == "mask"
+        photo, encoding, is_transparent = _read_stored(record, self.gain_map_problems, oriented=oriented, masked=masked)
         if photo.levels > 255 and file_kind(record.image) == "encoded" and record.gain_map_scale is None:
             self.largest_code = max(self.largest_code, int(photo.pixels.max()))
         if photo.white_from is not None and photo.levels == 255 and photo.above_white is None:
             photo = replace(photo, pixels=with_whole_white(photo.pixels, photo.white_from))
-        masks = resample.borders()
-        if stored is not None:
-            masks.append(resample(stored))
-        if photo.alpha is not None:
+        masks = resample.borders() + ([] if stored is None else [resample(stored)])
+        if is_transparent:
             self.transparent.add(name)
-            if self.alpha == "mask":
-                masks.append(resample(photo.alpha))
+        if masked and photo.alpha is not None:
+            masks.append(resample(photo.alpha))
         photo = self._at_view_size(
             photo, encoding, resample, resized=(camera.width, camera.height) != (lens.width, lens.height)
         )
@@ -253,17 +261,20 @@ class _Preprocessor:
             uncertain=record.uncertain,
         )
 
-    def _truth(self, record: ImageRecord, lens: Lens, resample: _Resampler) -> np.ndarray | None:
+    def _truth(self, record: ImageRecord, name: str, lens: Lens, resample: _Resampler) -> np.ndarray | None:
         """Return the truth of a photo at the size of its view; None without a file, or with one that cannot be used."""
         if record.hdr is None:
             return None
         try:
-            return resample(_read_truth(record.hdr, lens, resample.camera, resample.undistortion is not None))
+            truth = _read_truth(record.hdr, lens, resample.camera, resample.undistortion is not None)
         except InputError as error:
             if record.is_own_truth:
                 raise
             self.unusable_truth.append(error)
             return None
+        if record.derived and truth.coverage is not None:
+            self.transparent.add(name)
+        return resample(truth.pixels)
 
     def _resampler(self, record: ImageRecord, lens: Lens) -> _Resampler:
         """Return the resampler of a photo; photos of one lens in a row share its map, which is as large as an image."""
@@ -361,14 +372,14 @@ def _shrink(
     return area_average(image, to.width, to.height, values)
 
 
-def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> np.ndarray:
+def _read_truth(path: Path, lens: Lens, camera: Camera, bent: bool) -> Light:
     size = hdr_size(path)
     # Truth may be larger than the photos, because HDR-NeRF's evaluation averages it down, but never smaller.
     larger = size[0] >= camera.width and size[1] >= camera.height and _same_aspect(size, (lens.width, lens.height))
     if size != (lens.width, lens.height) and (bent or not larger):
         problem = f"HDR truth is {size[0]} x {size[1]}, the photo {lens.width} x {lens.height}"
         raise InputError(path, problem, "render the truth at the photo's size, or remove it")
-    return read_hdr(path)
+    return read_light(path)
 
 
 def _fitted_mask(path: Path, lens: Lens, oriented: bool, labeled: set[Path]) -> np.ndarray:

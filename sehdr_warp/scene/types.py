@@ -99,8 +99,7 @@ class Scene:
         photos_normalized: True if the photos were normalized; see ExposureCompensation.normalize_photos.
         color_matrix: [3, 3] from the primaries of the codes' light to linear Rec.709; None if these are Rec.709.
         unplaced: number of photos without a camera, which are in no view.
-        black_background: True if photos, other than OpenEXR pictures, have transparent parts that count as black light,
-            as those of rendered sets do.
+        black_background: True if photos have transparent parts that count as black light, as those of rendered sets do.
     """
 
     name: str

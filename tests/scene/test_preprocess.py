@@ -1,5 +1,6 @@
 """Views from photos: averages, undistortion, transparency."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,12 +8,13 @@ import threading
 import time
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
 from sehdr_warp.scene import preprocess
 from sehdr_warp.synth.expose import write_radiance
-from tests.make_scenes import edit_transforms, load, pattern, write_blender, write_colmap
+from tests.make_scenes import edit_transforms, edited_json, load, pattern, write_blender, write_colmap
 
 
 def test_photos_are_averaged_side_by_side(tmp_path):
@@ -66,6 +68,34 @@ def test_transparent_pixels_show_black_light(tmp_path):
     note = "transparency: 6 of 6 photos have transparent pixels, which count as black light"
     assert note in load(tmp_path, cache=tmp_path / "cache").notes
     np.testing.assert_allclose(view.image[:, 20:], pattern(40, 30, 0)[:, 20:] / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("derived", [False, True])
+@pytest.mark.parametrize("alpha", [None, 1.0, 0.0])
+def test_transparent_pixels_of_openexr_pictures_show_black_light(tmp_path, derived, alpha):
+    """As photos, and as truth that photos are computed from."""
+    write_blender(tmp_path, camera_angle_x=0.7)
+    light = np.random.default_rng(0).uniform(0.1, 1, (30, 40, 4)).astype(np.float32)
+    light[..., 3] = 1
+    light[:, :20, :3], light[:, :20, 3] = (0, 0.0 if alpha is None else alpha)
+    channels = {"RGB": light[..., :3].copy()} if alpha is None else {"RGBA": light}
+    with edited_json(tmp_path / "transforms.json") as values:
+        for i, frame in enumerate(values["frames"]):
+            place = f"train_hdr/hdr_{i:03d}.exr" if derived else f"images/r_{i}.exr"
+            (tmp_path / place).parent.mkdir(exist_ok=True)
+            with OpenEXR.File({}, channels) as file:
+                file.write(str(tmp_path / place))
+            (tmp_path / "images" / f"r_{i}.png").unlink()
+            frame["file_path"] = f"train/r_{i}" if derived else place
+    if derived:
+        edit_transforms(tmp_path, photo_response="reinhard-gamma")
+        (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
+        (tmp_path / "exposure_train.json").write_text(json.dumps({f"train/r_{i}_0.png": 1.0 for i in range(6)}))
+    scene = load(tmp_path, response="auto")
+    assert scene.black_background is (alpha == 0)
+    note = "transparency: 6 of 6 photos have transparent pixels, which count as black light"
+    assert (note in scene.notes) is (alpha == 0)
+    assert all(view.mask is None and view.image[:, :20].max() == 0 < view.image[:, 20:].min() for view in scene.views)
 
 
 def test_alpha_keeps_pixels_out(tmp_path):
