@@ -24,7 +24,7 @@ from .color_models import make_color_model
 from .fusion import NeuralExposureFusion
 from .gaussians import Gaussians
 from .pixel_filter import FocalRange, PhotoFilters, RayLimits
-from .renders import Background, CameraTensors, DirectionalRender, PhotoRender, RenderedView, unpremultiply
+from .renders import CameraTensors, DirectionalRender, PhotoRender, RenderedView, unpremultiply
 
 NO_DATA: Mapping[str, Tensor] = MappingProxyType({})
 _PIXELS_AT_ONCE = 1 << 19  # Of which colors are decoded
@@ -125,7 +125,6 @@ class RadianceField(nn.Module):
         encode: bool = True,
         opacity_factors: Tensor | None = None,
         order_axis: Tensor | None = None,
-        background: Background | None = None,
         sh_gradient_hook: Callable[[Tensor], object] | None = None,
     ) -> PhotoRender:
         """Render what a photo shows, differentiably: for training steps, render_ldr(), and fits to pictures.
@@ -139,7 +138,6 @@ class RadianceField(nn.Module):
             encode: If False, `encoded` stays None if `photo_exposure` is available.
             opacity_factors: [N] factors on the opacities that are rendered, at most 1, such as those of a dropout.
             order_axis: As in rasterize(); wide cameras order by distance.
-            background: Color behind the Gaussians; by default black.
             sh_gradient_hook: Receives, in the backward pass, the gradient [N, 3] by the color that each Gaussian's
                 harmonics have in this direction; the harmonics themselves then get no gradient.
         """
@@ -152,7 +150,7 @@ class RadianceField(nn.Module):
             values.register_hook(sh_gradient_hook)  # As retain_grad(), without a copy.
         if self.color_model.display_referred:
             rendering = self._rasterize(camera, self.color_model.colors(values), **options)
-            image = rendering.image if background is None else background.behind(rendering, ["encoded"])
+            image = rendering.image
             if ratio != 1.0:
                 image = self.response.encode_extended(self.response.decode(image.clamp(0, 1)) * ratio)
             return PhotoRender(image, None, None, rendering, opacities=opacities)
@@ -160,9 +158,8 @@ class RadianceField(nn.Module):
         first, *others = color_sets.values()
         features = torch.cat([first, *others], dim=1) if others else first
         rendering = self._rasterize(camera, features, **options)
-        image = rendering.image if background is None else background.behind(rendering, color_sets)
         # A single image is not split, because the derivative of a split is a copy.
-        parts = image.split(3, dim=2) if others else (image,)
+        parts = rendering.image.split(3, dim=2) if others else (rendering.image,)
         images = dict(zip(color_sets, parts, strict=True))
         encoded, exposure, photo_exposure = images.get("encoded"), images.get("exposure"), None
         if self.tone_map == "pixel":

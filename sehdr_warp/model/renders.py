@@ -1,10 +1,8 @@
 """Cameras on a device, and what rendering a radiance field returns: a training view, a view, light along directions."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from numbers import Real
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -36,19 +34,6 @@ class PhotoRender:
     rendering: Rendering
     photo_exposure: Tensor | None = None
     opacities: Tensor | None = None
-
-
-class Background(NamedTuple):
-    """A color behind the Gaussians of a training view."""
-
-    encoded: Tensor  # [3] as photos encode it
-    exposure: Tensor  # [3] exposure at the base time
-
-    def behind(self, rendering: Rendering, names: Iterable[str]) -> Tensor:
-        """Return the image of a rendering with this color behind it; names: of its images, as in PhotoRender."""
-        colors = [self.encoded if name == "encoded" else self.exposure for name in names]
-        color = colors[0] if len(colors) == 1 else torch.cat(colors)
-        return rendering.image + rendering.transmittance[..., None] * color
 
 
 @dataclass(frozen=True)

@@ -72,10 +72,6 @@ class ModelConfig(_Table):
     order_angle: Annotated[float, Field(ge=0.0, le=60.0)] = 25.0
     """most degrees, sideways and up or down, by which half of the steps turn at random the axis that Gaussians are
     ordered along, so that views turned away from the photos look right; 0: 3DGS; fisheyes and panoramas have none"""
-    background: Literal["black", "random"] = "black"
-    """what lies behind the Gaussians in training steps; black: 3DGS, whose surfaces may let some of it through; random:
-    a color drawn for each step, so that surfaces are opaque, for renders over other pictures. Rendered sets whose
-    transparent parts count as black light always have black, except for sets of OpenEXR pictures"""
     dropout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     """share of the Gaussians that the last step leaves out at random, against overfitting to few photos (DropGaussian);
     it grows from 0"""
@@ -138,6 +134,9 @@ class LossConfig(_Table):
     """weight of the mean opacity, which lets unneeded Gaussians fade for mcmc to relocate (3DGS-MCMC); it is 0 from the
     last relocation on and, where a photo shows less than a tenth of the scene, for new Gaussians until a photo shows
     them; more leaves surfaces transparent"""
+    transmittance_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """weight of the mean transmittance of the pixels, so that surfaces are opaque, in environment maps and over other
+    pictures too; it is 0 for rendered sets whose transparent parts count as black light"""
     size_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
     """weight of the mean size of the Gaussians in units of the cameras' radius (3DGS-MCMC), which shrinks those that no
     photo supports, and which can veil new views; it is 0 from the last relocation on, and where a photo

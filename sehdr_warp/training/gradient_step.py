@@ -12,14 +12,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..model.adam import Adam
 from ..model.gaussians import moments_of
 from ..model.radiance_field import RadianceField
-from ..model.renders import Background
 from ..rasterizer import HarmonicsGradients, Rendering
 from ..rasterizer.ops.step_updates import decide_step, differentiate, finiteness_of
 from ..rasterizer.tile_lists import MAX_SINGLE_SORT
@@ -28,7 +26,7 @@ from ..runs.config import Config
 from ..scene import Scene
 from .flat_gradients import FlatGradients
 from .hdr_truth import largest_hdr_truth
-from .losses import compared_image, data_loss, extra_images, opacity_loss, size_loss
+from .losses import compared_image, data_loss, extra_images, opacity_loss, size_loss, transmittance_loss
 from .ranks import Ranks
 from .strategies import SEED_STRIDE, Strategy
 from .training_views import TrainingView
@@ -40,9 +38,6 @@ with more intersections than the capacity. Neither kind of step is applied."""
 TURNED_STEPS = 0.5
 """Share of the steps that turn the axis of the order: with all of them, short trainings have 0.3 to 0.5 dB less on
 photos, and not more on views that are turned."""
-
-BACKGROUNDS = 997  # Number of colors that backgrounds are drawn from; a prime, so that each photo meets all
-BRIGHTEST = 0.7  # Encoded value up to which they are drawn; lights are far brighter than what encodes near 1
 
 
 @dataclass(frozen=True)
@@ -142,37 +137,6 @@ class OrderAxis:
                 component.fill_(generator.uniform(-slope, slope))  # Unlike a copy, it does not wait for a GPU.
 
 
-class RandomBackground:
-    """Draws a color that lies behind the Gaussians of each step (as nerfstudio does).
-
-    With black, a surface that lets through a tenth of it is as good as an opaque one that is a tenth darker. It looks
-    wrong over another picture, and from where more or less of it shows. With colors that change, only an opaque one
-    fits.
-
-    Attributes:
-        color: of the next step; None for black.
-    """
-
-    def __init__(self, field: RadianceField, enabled: bool, random_seed: int):
-        """Prepare to draw colors: evenly up to BRIGHTEST as photos encode them."""
-        self.color: Background | None = None
-        if enabled:
-            device, generator = field.gaussians.means.device, np.random.default_rng(random_seed)
-            encoded = generator.uniform(1 / 255, BRIGHTEST, (BACKGROUNDS, 3))
-            colors = encoded, field.response.start_exposures(encoded)
-            self._encoded, self._exposures = (torch.tensor(each, dtype=torch.float32, device=device) for each in colors)
-            self.color = Background(self._encoded[0].clone(), self._exposures[0].clone())
-
-    def draw(self, iteration: int) -> None:
-        """Draw the color of the step that ends at an iteration; the same in a resumed training.
-
-        It keeps its memory, because CUDA graphs read it.
-        """
-        if self.color is not None:
-            self.color.encoded.copy_(self._encoded[iteration % BACKGROUNDS])
-            self.color.exposure.copy_(self._exposures[iteration % BACKGROUNDS])
-
-
 class GradientStep:
     """Takes gradient steps of a training: prepare(), then run().
 
@@ -212,8 +176,7 @@ class GradientStep:
         self._spares_unseen = large_scene
         self._dropout = Dropout(config.model.dropout, config.seed, config.schedule.iterations, device)
         self._order = OrderAxis(config.model.order_angle, config.seed, device)
-        random_background = config.model.background == "random" and not scene.black_background
-        self._background = RandomBackground(field, random_background, config.seed)
+        self._transmittance_weight = 0.0 if scene.black_background else config.loss.transmittance_weight
         self._flat_gradients: FlatGradients | None = None  # Buffer that ranks exchange
 
     def graph_key(self, views: object, options: StepOptions) -> GraphKey | None:
@@ -228,7 +191,6 @@ class GradientStep:
         """Prepare what the step of an iteration reads or adds to: in a capture, it would lie in the graph's memory."""
         self._dropout.draw(iteration, self.field.gaussians.row_count)
         self._order.draw(iteration)
-        self._background.draw(iteration)
         if options.needs_means2d_grad:
             self.strategy.allocate(self.field.gaussians.row_count, self.step_counters.device)
 
@@ -274,10 +236,11 @@ class GradientStep:
             encode=not target.scale.compares_exposures,
             opacity_factors=self._dropout.factors,
             order_axis=self._order.axis,
-            background=self._background.color,
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
         )
         loss = data_loss(field, render, target, self._loss, self._largest_truth)
+        if self._transmittance_weight:
+            loss = loss + transmittance_loss(render, target, self._transmittance_weight)
         if options.opacity_weight:
             moments = None
             if self._spares_unseen and camera.directions is None:  # Renders of wide cameras have no extents.

@@ -155,6 +155,18 @@ def opacity_loss(field: RadianceField, render: PhotoRender, weight: float, momen
     return opacity_penalty(render.opacities, extents, moments, weight, field.gaussians.active_count)
 
 
+def transmittance_loss(render: PhotoRender, target: Target, weight: float) -> Tensor:
+    """Return `weight` times the mean transmittance of the pixels that the photo's mask keeps.
+
+    Black is behind the Gaussians, so a surface that lets through a tenth of it fits a photo as well as an opaque one
+    that is a tenth darker. Such a surface is too bright where several overlap in other directions, and over pictures.
+    """
+    transmittance, mask = render.rendering.transmittance, target.mask
+    if mask is None:
+        return weight * transmittance.mean()
+    return weight * (transmittance * mask.view_as(transmittance)).mean() / mask.mean().clamp_min(1e-6)
+
+
 def size_loss(gaussians: Gaussians, weight: float) -> Tensor:
     """Return `weight` times the mean of all standard deviations, in units of the normalized world.
 
