@@ -164,7 +164,7 @@ def transmittance_loss(render: PhotoRender, target: Target, weight: float) -> Te
     transmittance, mask = render.rendering.transmittance, target.mask
     if mask is None:
         return weight * transmittance.mean()
-    return weight * (transmittance * mask.view_as(transmittance)).mean() / mask.mean().clamp_min(1e-6)
+    return weight * (transmittance * mask[..., 0]).mean() / mask.mean().clamp_min(1e-6)
 
 
 def size_loss(gaussians: Gaussians, weight: float) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 
 from sehdr_warp.model.gaussians import Gaussians
 from sehdr_warp.model.renders import PhotoRender
+from sehdr_warp.rasterizer import Rendering
 from sehdr_warp.rasterizer.losses.ssim import ssim
 from sehdr_warp.response import ToneMapper, response_by_name
 from sehdr_warp.runs.config import LossConfig
@@ -21,6 +22,7 @@ from sehdr_warp.training.losses import (
     ldr_loss,
     linear_loss,
     size_loss,
+    transmittance_loss,
 )
 from sehdr_warp.training.targets import CODE, mu_law, mu_of_knee
 
@@ -167,6 +169,18 @@ def test_the_size_loss_is_the_mean_size_and_its_gradient_is_exact(device, reserv
     # The one without bound stays: its size is not that of its parameter.
     torch.testing.assert_close(gradient[2:40].cpu(), exact.grad[2:].float(), rtol=1e-5, atol=0)
     assert gradient.isfinite().all() and not gradient[:2].any() and not gradient[40:].any()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_transmittance_loss_is_the_mean_over_what_the_mask_keeps(masked):
+    transmittance = torch.rand(3, 5, dtype=torch.float64).requires_grad_()
+    mask = torch.tensor([1.0, 0.5, 0.0]).double().view(3, 1, 1).expand(3, 5, 1) if masked else None
+    empty = torch.zeros(0)
+    rendering = Rendering(torch.zeros(3, 5, 3), transmittance, empty, empty, empty, 0)
+    render = PhotoRender(None, None, None, rendering)
+    weights = torch.ones(3, 5).double() if mask is None else mask[..., 0]
+    transmittance_loss(render, replace(target_of(torch.zeros(3, 5, 3)), mask=mask), 0.2).backward()
+    assert torch.allclose(transmittance.grad, 0.2 * weights / weights.sum())
 
 
 def test_the_hdr_loss_compares_in_the_mu_law():
