@@ -45,8 +45,7 @@ class StepOptions:
     """Options of a step that change in the course of a training."""
 
     degree: int  # SH degree
-    opacity_weight: float  # Weight of the mean opacity in the loss
-    size_weight: float  # Weight of the mean size in the loss
+    refines: bool  # Whether the strategy still changes the number of Gaussians
     needs_means2d_grad: bool  # Whether the strategy accumulates the gradients of the projected means
 
 
@@ -239,15 +238,15 @@ class GradientStep:
             sh_gradient_hook=sh_gradients.append if self.defer_sh_gradients else None,
         )
         loss = data_loss(field, render, target, self._loss, self._largest_truth)
-        if self._transmittance_weight:
-            loss = loss + transmittance_loss(render, target, self._transmittance_weight)
-        if options.opacity_weight:
+        if options.refines and self._loss.opacity_weight:
             moments = None
             if self._spares_unseen and camera.directions is None:  # Renders of wide cameras have no extents.
                 moments = moments_of(self.optimizer, field.gaussians.opacity_logits).get("exp_avg_sq")
-            loss = loss + opacity_loss(field, render, options.opacity_weight, moments)
-        if options.size_weight and not self._spares_unseen:
-            loss = loss + size_loss(field.gaussians, options.size_weight)
+            loss = loss + opacity_loss(field, render, self._loss.opacity_weight, moments)
+        if options.refines and self._loss.size_weight and not self._spares_unseen:
+            loss = loss + size_loss(field.gaussians, self._loss.size_weight)
+        if not options.refines and self._transmittance_weight:  # Earlier, it would make misplaced surfaces opaque.
+            loss = loss + transmittance_loss(render, target, self._transmittance_weight)
         # Drop references to tensors that the backward pass does not need, so that their memory is reused in it.
         names = {"image", "transmittance", "depths"}
         if options.needs_means2d_grad:

@@ -239,10 +239,8 @@ class Trainer:
         self._view_index = self.sampler.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
-        # The penalties on opacities and sizes end with the refinements.
-        refines, loss = not self.strategy.schedule.is_over(self.iteration), self.config.loss
-        opacity_weight, size_weight = (loss.opacity_weight, loss.size_weight) if refines else (0.0, 0.0)
-        options = StepOptions(self.degree, opacity_weight, size_weight, self.strategy.needs_gradients(self.iteration))
+        refines = not self.strategy.schedule.is_over(self.iteration)
+        options = StepOptions(self.degree, refines, self.strategy.needs_gradients(self.iteration))
 
         # Forward, loss, backward, optimizer step: GradientStep.run().
         views, next_index = self.data_manager.views, self.sampler.peek()
