@@ -8,9 +8,9 @@ its poles. The inverse covariance is kept as two vectors a and b across n, such 
     exponent = -((a . d)^2 + (b . d)^2) / (2 (n . d)^2),    n . d > 0.
 
 Within a cap around n a Gaussian counts. Directions come in tiles of 16 x 16, and these in blocks; each has a cap as
-well, and two caps that do not meet share no pixel. A tile's list is ordered by distance and blended by one thread a
-pixel, front to back. The backward pass walks it back to front as that of blend_cpu.py does. Warp generates the adjoint
-of the projection.
+well, and two caps that do not meet share no pixel. A tile's list is ordered by distance and blended front to back: by
+one thread a pixel, on the CPU by sphere_cpu.py. The backward pass walks it back to front as that of blend_cpu.py does.
+Warp generates the adjoint of the projection.
 """
 
 from functools import cache
@@ -120,14 +120,15 @@ def projection_kernel(dtype, antialiased: bool, own_positions: bool):
 def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
     """Return list_tiles, blend and blend_backward for one scalar type and number of channels."""
     g = geometry(dtype)
-    real, vec3, vec4 = g.real, g.vec3, g.vec4
+    real, vec2, vec3, vec4 = g.real, vector(2, dtype), g.vec3, g.vec4
     features_type = vector(channels, dtype)
     options = NO_AUTODIFF | {"fuse_fp": False}
 
     @wp.func
-    def caps_meet(one: vec4, other: vec4) -> bool:
-        reach = wp.min(one[3] + other[3] + real(1.0e-6), real(3.1415926))
-        return one[0] * other[0] + one[1] * other[1] + one[2] * other[2] >= wp.cos(reach)
+    def caps_meet(middle: real, cosine: real, sine: real, other_cosine: real, other_sine: real) -> bool:
+        """Return whether caps meet; middle: cosine between their axes, the others: of their angles."""
+        apart = cosine * other_cosine - sine * other_sine - real(1.0e-6)
+        return cosine + other_cosine <= real(0.0) or middle >= apart
 
     @wp.func
     def falloff(squared: real, forward: real) -> real:
@@ -139,29 +140,38 @@ def sphere_kernels(dtype, channels: int) -> SimpleNamespace:
 
     @wp.kernel(module="unique", module_options=options)
     def list_tiles(
-        range_start: int, order: wp.array(dtype=wp.int32), caps: wp.array(dtype=vec4), tile_caps: wp.array(dtype=vec4),
-        block_caps: wp.array(dtype=vec4), columns: int, rows: int, starts: wp.array(dtype=wp.int32),
+        range_start: int, order: wp.array(dtype=wp.int32), caps: wp.array(dtype=vec4),
+        tile_axes: wp.array(dtype=vec3), tile_angles: wp.array(dtype=vec2),
+        block_axes: wp.array(dtype=vec3), block_angles: wp.array(dtype=vec2),
+        columns: int, rows: int, starts: wp.array(dtype=wp.int32),
         counts: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32), gaussians: wp.array(dtype=wp.int32),
     ):
         """Count the tiles that each Gaussian touches and, if there is memory, list them.
 
-        Intersections of the Gaussian at `nth` in the order are written from starts[nth] on.
+        Intersections of the Gaussian at `nth` in the order are written from starts[nth] on. tile_angles, block_angles:
+        cosine and sine of each cap's angle.
         """
         nth = range_start + wp.tid()
         gaussian = order[nth]
         cap = caps[gaussian]
         count = int(0)
         if cap[3] > real(0.0):
+            axis = vec3(cap[0], cap[1], cap[2])
+            cosine = wp.cos(cap[3])
+            sine = wp.sin(cap[3])
             across = (columns + BLOCK_TILES - 1) // BLOCK_TILES
-            for block in range(block_caps.shape[0]):
-                if caps_meet(cap, block_caps[block]):
+            for block in range(block_axes.shape[0]):
+                angle = block_angles[block]
+                if caps_meet(wp.dot(axis, block_axes[block]), cosine, sine, angle[0], angle[1]):
                     top = (block // across) * BLOCK_TILES
                     left = (block % across) * BLOCK_TILES
                     for row in range(top, wp.min(top + BLOCK_TILES, rows)):
                         for column in range(left, wp.min(left + BLOCK_TILES, columns)):
-                            if caps_meet(cap, tile_caps[row * columns + column]):
+                            tile = row * columns + column
+                            angle = tile_angles[tile]
+                            if caps_meet(wp.dot(axis, tile_axes[tile]), cosine, sine, angle[0], angle[1]):
                                 if tiles.shape[0] > 0:
-                                    tiles[starts[nth] + count] = row * columns + column
+                                    tiles[starts[nth] + count] = tile
                                     gaussians[starts[nth] + count] = gaussian
                                 count += 1
         counts[nth] = count

@@ -6,8 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..kernels import sphere_cpu
 from ..kernels.constants import ALPHA_THRESHOLD, EPS2D, NEAR_PLANE, TILE_SIZE
 from ..kernels.sphere import BLOCK_TILES, projection_kernel, sphere_kernels
+from .blending import exp_squarings
 from .checks import (
     boolean,
     check_channels,
@@ -30,6 +32,7 @@ from .warp_launch.launching import launch, warp_scalar
 from .warp_launch.threads import even_ranges
 
 _PIXELS = TILE_SIZE * TILE_SIZE
+TILES_AT_ONCE = 2048  # That the CPU blends in one launch
 
 
 @partial(torch_operation, compiles=True)
@@ -151,7 +154,7 @@ def _list_tiles(caps: Tensor, depths: Tensor, directions: Tensor, keep_emit_orde
     tile_caps, block_caps = (caps_of(directions, side * TILE_SIZE) for side in (1, BLOCK_TILES))
     kernel = sphere_kernels(warp_scalar(caps.dtype), 1).list_tiles
     order = depth_order(depths, caps[:, 3:].expand(-1, 2).contiguous())
-    shared = order, caps, tile_caps, block_caps, *grid
+    shared = order, caps, *tile_caps, *block_caps, *grid
     counts, none = torch.empty_like(order), order[:0]
     launch(kernel, count, *shared, order, counts, none, none, min_range=256)
     cumulative_counts = counts.cumsum(0)
@@ -166,6 +169,23 @@ def _list_tiles(caps: Tensor, depths: Tensor, directions: Tensor, keep_emit_orde
     return TileLists(tile_ranges, gaussians, None, emit_order, emit_indices, width, height, None, total.clone())
 
 
+def _blend_on_cpu(inputs: tuple, outputs: tuple[Tensor, ...], opacities: Tensor, tiles: int) -> None:
+    """Fill outputs of a blend, some tiles after others, so that scratch is small however large the picture is."""
+    image, alpha_threshold = outputs[0], inputs[-1]
+    scalar, channels = warp_scalar(image.dtype), image.shape[1]
+    highest = float(opacities.max()) if len(opacities) else 0.0
+    kernel = sphere_cpu.forward_kernel(scalar, channels, exp_squarings(alpha_threshold / max(highest, 1.0)))
+    at_once = min(tiles, TILES_AT_ONCE)
+
+    def scratch(*shape: int) -> Tensor:
+        return image.new_empty(at_once, *shape)
+
+    rows = sphere_cpu.ROWS, sphere_cpu.LANES
+    arrays = scratch(3, *rows), scratch(sphere_cpu.ROWS, 5), scratch(*rows), scratch(*rows), scratch(channels, *rows)
+    for first in range(0, tiles, at_once):
+        launch(kernel, min(at_once, tiles - first), first, *inputs, *arrays, *outputs, min_range=1)
+
+
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, caps, across, along, opacities, features, directions, lists: TileLists, alpha_threshold: float):
@@ -177,8 +197,11 @@ class _Blend(torch.autograd.Function):
         ctx.kernels, ctx.lists = sphere_kernels(warp_scalar(features.dtype), channels), lists
         ctx.pixels = lists.tile_ranges.shape[0] * _PIXELS
         ctx.inputs = lists.tile_ranges, lists.gaussians, directions.view(-1, 3)
-        arguments = *ctx.inputs, *splats, *ctx.sizes, image.view(-1, channels), transmittance, ends
-        launch(ctx.kernels.blend, ctx.pixels, *arguments, min_range=_PIXELS)
+        inputs, outputs = (*ctx.inputs, *splats, *ctx.sizes), (image.view(-1, channels), transmittance, ends)
+        if image.is_cpu:
+            _blend_on_cpu(inputs, outputs, opacities, lists.grid.tiles)
+        else:
+            launch(ctx.kernels.blend, ctx.pixels, *inputs, *outputs, min_range=_PIXELS)
         ctx.save_for_backward(caps, across, along, opacities, features, transmittance, ends)
         return image, transmittance
 
@@ -201,8 +224,15 @@ class _Blend(torch.autograd.Function):
         return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None, None
 
 
-def caps_of(directions: Tensor, side: int) -> Tensor:
-    """Return caps [blocks, 4], by rows: mean direction of each side x side pixels, and the largest angle to it."""
+class DirectionCaps(NamedTuple):
+    """Caps around directions of blocks of pixels, by rows."""
+
+    axes: Tensor  # [blocks, 3] mean direction of each block
+    angles: Tensor  # [blocks, 2] cosine and sine of the largest angle to it
+
+
+def caps_of(directions: Tensor, side: int) -> DirectionCaps:
+    """Return caps of each side x side pixels of directions [H, W, 3]."""
     height, width = directions.shape[:2]
     rows, columns = -(-height // side), -(-width // side)
     # What is missing at the end repeats the last pixels.
@@ -215,4 +245,5 @@ def caps_of(directions: Tensor, side: int) -> Tensor:
     axis = torch.where(length > 1e-3, mean / length.clamp_min(1e-3), blocks[:, 0])
     # By the chord: an arc cosine loses half of the digits near 1.
     chord = (blocks - axis[:, None]).norm(dim=2).amax(1)
-    return torch.cat([axis, 2 * torch.asin((chord / 2).clamp(max=1))[:, None]], dim=1).contiguous()
+    half = (chord / 2).clamp(max=1)  # Sine of half of the angle
+    return DirectionCaps(axis.contiguous(), torch.stack([1 - 2 * half**2, 2 * half * (1 - half**2).sqrt()], dim=1))

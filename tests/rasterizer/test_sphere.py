@@ -16,8 +16,22 @@ def test_caps_hold_their_directions():
         caps = caps_of(directions, side)
         columns = -(-50 // side)
         for y, x in ((0, 0), (24, 49), (13, 31)):
-            cap = caps[(y // side) * columns + x // side]
-            assert float(torch.dot(cap[:3], directions[y, x]).clamp(-1, 1).acos()) <= float(cap[3]) + 1e-9
+            axis, (cosine, sine) = (tensor[(y // side) * columns + x // side] for tensor in caps)
+            angle = float(torch.atan2(sine, cosine))
+            assert float(torch.dot(axis, directions[y, x]).clamp(-1, 1).acos()) <= angle + 1e-9
+
+
+def test_some_tiles_after_others_are_as_all_at_once(monkeypatch):
+    scene, directions = gaussians(dtype=torch.float32), latlong(200, dtype=torch.float32)
+
+    def pictures(tiles: int) -> list[torch.Tensor]:
+        monkeypatch.setattr(sphere, "TILES_AT_ONCE", tiles)
+        tensors = [tensor.clone().requires_grad_() for tensor in scene]
+        image, left = rasterize_directions(*tensors, torch.zeros(3), directions, focal_length=FOCAL)
+        (image.sum() + left.square().sum()).backward()
+        return [image, left, *(tensor.grad for tensor in tensors)]
+
+    assert all(map(torch.equal, pictures(5), pictures(2048)))
 
 
 @pytest.mark.parametrize("count", [0, 1, 300])
