@@ -1,7 +1,8 @@
 """Splats seen in any directions from one point: environment maps, as latitude and longitude or the faces of a cube."""
 
+from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,10 +30,11 @@ from .projection import expand_to_gaussians, launch_projection, torch_sums_gradi
 from .tile_lists import EmitOrder, TileLists, check_intersection_count, depth_order, lists_by_tile, tile_grid
 from .torch_contract import once_differentiable, torch_operation
 from .warp_launch.launching import launch, warp_scalar
-from .warp_launch.threads import even_ranges
 
 _PIXELS = TILE_SIZE * TILE_SIZE
 TILES_AT_ONCE = 2048  # That the CPU blends in one launch
+_ROWS = sphere_cpu.ROWS, sphere_cpu.LANES  # Shapes of a tile's scratch
+_DIRECTIONS, _CAPS = (3, *_ROWS), (sphere_cpu.ROWS, 5)
 
 
 @partial(torch_operation, compiles=True)
@@ -169,21 +171,17 @@ def _list_tiles(caps: Tensor, depths: Tensor, directions: Tensor, keep_emit_orde
     return TileLists(tile_ranges, gaussians, None, emit_order, emit_indices, width, height, None, total.clone())
 
 
-def _blend_on_cpu(inputs: tuple, outputs: tuple[Tensor, ...], opacities: Tensor, tiles: int) -> None:
-    """Fill outputs of a blend, some tiles after others, so that scratch is small however large the picture is."""
-    image, alpha_threshold = outputs[0], inputs[-1]
-    scalar, channels = warp_scalar(image.dtype), image.shape[1]
-    highest = float(opacities.max()) if len(opacities) else 0.0
-    kernel = sphere_cpu.forward_kernel(scalar, channels, exp_squarings(alpha_threshold / max(highest, 1.0)))
-    at_once = min(tiles, TILES_AT_ONCE)
+def _launch_by_tiles(
+    kernel: Any, tiles: int, inputs: Sequence[Any], scratch: Sequence[tuple[int, ...]], others: Sequence[Tensor]
+) -> None:
+    """Launch a kernel of sphere_cpu.py, some tiles after others: so scratch is small however large the picture is.
 
-    def scratch(*shape: int) -> Tensor:
-        return image.new_empty(at_once, *shape)
-
-    rows = sphere_cpu.ROWS, sphere_cpu.LANES
-    arrays = scratch(3, *rows), scratch(sphere_cpu.ROWS, 5), scratch(*rows), scratch(*rows), scratch(channels, *rows)
+    scratch: shapes of the arrays between inputs and others, for each tile.
+    """
+    at_once, like = min(tiles, TILES_AT_ONCE), others[0]
+    arrays = [like.new_empty(at_once, *shape) for shape in scratch]
     for first in range(0, tiles, at_once):
-        launch(kernel, min(at_once, tiles - first), first, *inputs, *arrays, *outputs, min_range=1)
+        launch(kernel, min(at_once, tiles - first), first, *inputs, *arrays, *others, min_range=1)
 
 
 class _Blend(torch.autograd.Function):
@@ -193,15 +191,19 @@ class _Blend(torch.autograd.Function):
         splats = tuple(tensor.detach() for tensor in (caps, across, along, opacities, features))
         image, transmittance = features.new_empty(height, width, channels), features.new_empty(height, width)
         ends = torch.empty(height, width, dtype=torch.int32, device=image.device)
-        ctx.sizes = lists.grid.columns, width, height, alpha_threshold
-        ctx.kernels, ctx.lists = sphere_kernels(warp_scalar(features.dtype), channels), lists
-        ctx.pixels = lists.tile_ranges.shape[0] * _PIXELS
+        ctx.lists, ctx.sizes = lists, (lists.grid.columns, width, height, alpha_threshold)
+        ctx.kind = warp_scalar(features.dtype), channels
         ctx.inputs = lists.tile_ranges, lists.gaussians, directions.view(-1, 3)
         inputs, outputs = (*ctx.inputs, *splats, *ctx.sizes), (image.view(-1, channels), transmittance, ends)
         if image.is_cpu:
-            _blend_on_cpu(inputs, outputs, opacities, lists.grid.tiles)
+            highest = float(opacities.max()) if len(opacities) else 0.0
+            ctx.kind = *ctx.kind, exp_squarings(alpha_threshold / max(highest, 1.0))
+            kernel = sphere_cpu.forward_kernel(*ctx.kind)
+            scratch = _DIRECTIONS, _CAPS, _ROWS, _ROWS, (channels, *_ROWS)
+            _launch_by_tiles(kernel, lists.grid.tiles, inputs, scratch, outputs)
         else:
-            launch(ctx.kernels.blend, ctx.pixels, *inputs, *outputs, min_range=_PIXELS)
+            kernel = sphere_kernels(*ctx.kind).blend
+            launch(kernel, len(lists.tile_ranges) * _PIXELS, *inputs, *outputs, min_range=_PIXELS)
         ctx.save_for_backward(caps, across, along, opacities, features, transmittance, ends)
         return image, transmittance
 
@@ -209,16 +211,19 @@ class _Blend(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_image, grad_transmittance):
         *splats, transmittance, ends = ctx.saved_tensors
-        lists, emit_order, (count, channels) = ctx.lists, ctx.lists.emit_order, splats[-1].shape
-        # On the CPU each intersection has gradients, and whole tiles go to a thread: sums keep one order.
-        emit_indices = lists.gaussians if emit_order is None else lists.emit_indices
-        gradients = grad_image.new_zeros(count if emit_order is None else len(emit_indices), channels + 10)
+        lists, (count, channels) = ctx.lists, splats[-1].shape
         upstream = grad_image.contiguous().view(-1, channels), grad_transmittance.contiguous()
-        arguments = *ctx.inputs, *splats, *ctx.sizes, transmittance, ends, emit_indices, *upstream, gradients
-        ranges = even_ranges(ctx.pixels // _PIXELS, 1) * _PIXELS
-        launch(ctx.kernels.blend_backward, ctx.pixels, *arguments, ranges=ranges)
-        if emit_order is not None:
-            gradients = sum_by_gaussian(gradients, *emit_order)
+        inputs = *ctx.inputs, *splats, *ctx.sizes
+        if grad_image.is_cpu:  # Each intersection has gradients, so that sums keep one order.
+            gradients = grad_image.new_zeros(len(lists.emit_indices), channels + 10)
+            scratch = _DIRECTIONS, _CAPS, _ROWS, _ROWS, (channels, *_ROWS), _ROWS, (channels, sphere_cpu.LANES)
+            others = transmittance, ends, lists.emit_indices, *upstream, gradients
+            _launch_by_tiles(sphere_cpu.backward_kernel(*ctx.kind), lists.grid.tiles, inputs, scratch, others)
+            gradients = sum_by_gaussian(gradients, *lists.emit_order)
+        else:
+            gradients = grad_image.new_zeros(count, channels + 10)
+            others = transmittance, ends, lists.gaussians, *upstream, gradients
+            launch(sphere_kernels(*ctx.kind).blend_backward, len(lists.tile_ranges) * _PIXELS, *inputs, *others)
         grad_axis, grad_across, grad_along, grad_opacity, grad_features = gradients.split((3, 3, 3, 1, channels), dim=1)
         grad_caps = torch.nn.functional.pad(grad_axis, (0, 1))
         return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None, None

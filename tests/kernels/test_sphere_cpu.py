@@ -6,6 +6,7 @@ import torch
 
 from sehdr_warp.rasterizer import rasterize_directions
 
+from ..rasterizer.scenes import finite_differences, random_like, relative_error
 from .test_sphere import FOCAL, gaussians, latlong, reference
 
 
@@ -52,3 +53,35 @@ def test_opaque_gaussians_end_a_pixel_and_huge_ones_cover_all():
     assert torch.allclose(image[ahead][:, 0], torch.tensor(0.99), atol=0.02)
     assert (image[ahead][:, 2] < 1e-3).all() and (left[ahead] >= 1e-4).all()
     assert image[directions[..., 2] < 0].abs().max() == 0 and left[directions[..., 2] < 0].min() == 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_gradients_of_a_picture_are_the_sums_of_those_of_its_pixels(dtype):
+    """Many Gaussians, some of them opaque: pixels end at different ones, and some alphas are at their limit."""
+    scene, directions = gaussians(900, dtype=dtype, size=-1.0), scattered(18, 11).to(dtype)
+    scene[3][::3] = 1.0
+
+    def gradients(directions: torch.Tensor) -> list[torch.Tensor]:
+        leaves = [tensor.clone().requires_grad_() for tensor in scene]
+        image, left = rasterize_directions(*leaves, torch.zeros(3, dtype=dtype), directions, focal_length=FOCAL)
+        return list(torch.autograd.grad(image.square().sum() + left.square().sum(), leaves))
+
+    singles = [gradients(directions[row, column][None, None]) for row in range(18) for column in range(11)]
+    for whole, parts in zip(gradients(directions), zip(*singles, strict=True), strict=True):
+        assert float(whole.abs().max()) > 0
+        assert relative_error(whole, sum(part.double() for part in parts)) < (1e-12 if dtype is torch.float64 else 1e-5)
+
+
+@pytest.mark.parametrize("which", range(5))
+def test_gradients_of_scattered_directions_match_finite_differences(which):
+    tensors, directions = gaussians(9, size=-0.7), scattered(5, 13)
+    tensors[3] = tensors[3] * 0.3
+
+    def loss(*tensors):
+        place = torch.tensor([0.1, -0.2, 0.15], dtype=torch.float64)
+        image, left = rasterize_directions(*tensors, place, directions, focal_length=FOCAL, alpha_threshold=1e-7)
+        return (image * random_like(image, 5)).sum() + left.square().sum()
+
+    leaves = [tensor.clone().requires_grad_() for tensor in tensors]
+    loss(*leaves).backward()
+    assert relative_error(leaves[which].grad, finite_differences(loss, tensors, which)) < 1e-6
