@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from ..errors import InputError, did_you_mean
+from ..errors import InputError, did_you_mean, path_of
 from ..files import read_text
 from .config import Config, ConfigError
 
@@ -56,8 +56,13 @@ def load_config(
 
     Raises:
         InputError: With file, field and value, for anything missing, unknown or wrong.
+        TypeError: For a preset or overrides of another type.
     """
-    config = config_from_dict(*_read(preset))
+    if isinstance(preset, Mapping):
+        raise TypeError(f"preset is {preset!r:.60}, expected a name or a file; pass fields as overrides")
+    if not isinstance(overrides or {}, Mapping):
+        raise TypeError(f"overrides is {overrides!r:.60}, expected a dict of field names and values")
+    config = config_from_dict(*_read(preset if isinstance(preset, str) else path_of(preset, "preset")))
     return override_config(config, overrides or {}, "overrides", flags)
 
 

@@ -142,3 +142,18 @@ def test_base_and_overrides(tmp_path):
     assert override_config(config, {"seed": 9}).seed == 9
     with pytest.raises(InputError, match="seed = -1"):
         override_config(config, {"seed": -1})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((None,), "preset is None, expected a path, as text or pathlib.Path"),
+        ((["demo"],), r"preset is \['demo'\], expected a path"),
+        (({"seed": 1},), r"preset is \{'seed': 1\}, expected a name or a file; pass fields as overrides"),
+        (("demo", ["seed"]), r"overrides is \['seed'\], expected a dict of field names and values"),
+        (("demo", "seed=1"), "overrides is 'seed=1', expected a dict of field names and values"),
+    ],
+)
+def test_arguments_of_another_type_are_named(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        load_config(*arguments)
