@@ -36,6 +36,7 @@ def direction_functions(dtype) -> DirectionFunctions:
         index: int, x0: int, y0: int, width: int, height: int, directions: wp.array(dtype=vec3),
         row_directions: wp.array3d(dtype=row), row_caps: wp.array2d(dtype=cap_of_row),
     ):
+        """Fill the directions and caps of the rows of a tile, whose first pixel is (x0, y0)."""
         for at in range(row_caps.shape[1]):
             # Of pixels beyond the picture's border no direction is known, and 0 is in front of no Gaussian.
             dx = row(real(0.0))
@@ -71,7 +72,7 @@ def direction_functions(dtype) -> DirectionFunctions:
 
     @wp.func
     def meets(cap: vec4, cosine: real, sine: real, other: cap_of_row) -> bool:
-        """cosine, sine: of the angle of `cap`."""
+        """Return whether the cap of a Gaussian meets that of a row; cosine, sine: of the angle of the Gaussian's."""
         middle = cap[0] * other[0] + cap[1] * other[1] + cap[2] * other[2]
         return other[3] < real(0.0) or middle >= cosine * other[3] - sine * other[4] - real(1.0e-6)
 

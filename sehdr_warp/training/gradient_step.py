@@ -164,7 +164,7 @@ class GradientStep:
         """Prepare steps of a training.
 
         The HDR truth of the scene scales the HDR loss. In a large scene the opacity penalty spares Gaussians that no
-        photo has shown yet, and sizes have no penalty.
+        photo has shown yet, and sizes have no penalty; before a black background transmittance has none.
         """
         self.field, self.optimizer, self.strategy, self.ranks = field, optimizer, strategy, ranks
         self._loss, device = config.loss, field.gaussians.means.device

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import sehdr_warp
 import sehdr_warp as sw
 
 
@@ -42,7 +41,7 @@ PATHS = {
 
 @pytest.mark.parametrize("name", PATHS)
 @pytest.mark.parametrize("path", [None, 5, ["a.exr"]])
-def test_a_path_that_is_none_is_named(run, scene, name, path):
+def test_what_is_no_path_is_named(run, scene, name, path):
     with pytest.raises(TypeError, match=r"^(path|out|folder|stack) is .*, expected a path, as text or pathlib.Path$"):
         PATHS[name](run, scene, path)
 
@@ -116,7 +115,7 @@ def test_compare_runs_takes_a_list(run):
             sw.compare_runs(value)
 
 
-PHOTOS = Path(sehdr_warp.__file__).parent / "embedded" / "room" / "train"
+PHOTOS = Path(sw.__file__).parent / "embedded" / "room" / "train"
 PICTURE = np.ones((4, 6, 3), np.float32)
 
 
