@@ -181,7 +181,8 @@ def _launch_by_tiles(
     at_once, like = min(tiles, TILES_AT_ONCE), others[0]
     arrays = [like.new_empty(at_once, *shape) for shape in scratch]
     for first in range(0, tiles, at_once):
-        launch(kernel, min(at_once, tiles - first), first, *inputs, *arrays, *others, min_range=1)
+        arguments = first, *inputs, *arrays, *others
+        launch(kernel, min(at_once, tiles - first), *arguments, min_range=1)
 
 
 class _Blend(torch.autograd.Function):
@@ -194,7 +195,7 @@ class _Blend(torch.autograd.Function):
         ctx.lists, ctx.sizes = lists, (lists.grid.columns, width, height, alpha_threshold)
         ctx.kind = warp_scalar(features.dtype), channels
         ctx.inputs = lists.tile_ranges, lists.gaussians, directions.view(-1, 3)
-        inputs, outputs = (*ctx.inputs, *splats, *ctx.sizes), (image.view(-1, channels), transmittance, ends)
+        inputs, outputs = [*ctx.inputs, *splats, *ctx.sizes], [image.view(-1, channels), transmittance, ends]
         if image.is_cpu:
             highest = float(opacities.max()) if len(opacities) else 0.0
             ctx.kind = *ctx.kind, exp_squarings(alpha_threshold / max(highest, 1.0))
@@ -202,8 +203,8 @@ class _Blend(torch.autograd.Function):
             scratch = _DIRECTIONS, _CAPS, _ROWS, _ROWS, (channels, *_ROWS)
             _launch_by_tiles(kernel, lists.grid.tiles, inputs, scratch, outputs)
         else:
-            kernel = sphere_kernels(*ctx.kind).blend
-            launch(kernel, len(lists.tile_ranges) * _PIXELS, *inputs, *outputs, min_range=_PIXELS)
+            kernel, arguments = sphere_kernels(*ctx.kind).blend, inputs + outputs
+            launch(kernel, len(lists.tile_ranges) * _PIXELS, *arguments, min_range=_PIXELS)
         ctx.save_for_backward(caps, across, along, opacities, features, transmittance, ends)
         return image, transmittance
 
@@ -213,17 +214,18 @@ class _Blend(torch.autograd.Function):
         *splats, transmittance, ends = ctx.saved_tensors
         lists, (count, channels) = ctx.lists, splats[-1].shape
         upstream = grad_image.contiguous().view(-1, channels), grad_transmittance.contiguous()
-        inputs = *ctx.inputs, *splats, *ctx.sizes
+        inputs = [*ctx.inputs, *splats, *ctx.sizes]
         if grad_image.is_cpu:  # Each intersection has gradients, so that sums keep one order.
             gradients = grad_image.new_zeros(len(lists.emit_indices), channels + 10)
             scratch = _DIRECTIONS, _CAPS, _ROWS, _ROWS, (channels, *_ROWS), _ROWS, (channels, sphere_cpu.LANES)
-            others = transmittance, ends, lists.emit_indices, *upstream, gradients
+            others = [transmittance, ends, lists.emit_indices, *upstream, gradients]
             _launch_by_tiles(sphere_cpu.backward_kernel(*ctx.kind), lists.grid.tiles, inputs, scratch, others)
             gradients = sum_by_gaussian(gradients, *lists.emit_order)
         else:
             gradients = grad_image.new_zeros(count, channels + 10)
-            others = transmittance, ends, lists.gaussians, *upstream, gradients
-            launch(sphere_kernels(*ctx.kind).blend_backward, len(lists.tile_ranges) * _PIXELS, *inputs, *others)
+            kernel = sphere_kernels(*ctx.kind).blend_backward
+            arguments = [*inputs, transmittance, ends, lists.gaussians, *upstream, gradients]
+            launch(kernel, len(lists.tile_ranges) * _PIXELS, *arguments)
         grad_axis, grad_across, grad_along, grad_opacity, grad_features = gradients.split((3, 3, 3, 1, channels), dim=1)
         grad_caps = torch.nn.functional.pad(grad_axis, (0, 1))
         return grad_caps, grad_across, grad_along, grad_opacity[:, 0], grad_features, None, None, None

@@ -51,7 +51,8 @@ def test_transparency_of_openexr_counts_as_that_of_other_photos(tmp_path):
     alpha = np.ones((24, 32), np.float32)
     alpha[:6], alpha[6:12] = 0, 0.5
     scene = load_scene(posed(tmp_path, lambda path, i: _write_cut_out(path, picture(i), alpha), ".exr"))
-    assert "transparency" not in str(scene.notes) and scene.views[0].mask is None
+    assert "transparency: 6 of 6 photos have transparent pixels, which count as black light" in scene.notes
+    assert scene.views[0].mask is None
     np.testing.assert_allclose(light_of(scene.views[0], scene), picture() * alpha[..., None], rtol=2e-3, atol=1e-3)
     pytest.importorskip("pycolmap")
     write_colmap(tmp_path / "set", size=(32, 24), params=(40.0, 40.0, 16.0, 12.0))
