@@ -22,11 +22,14 @@ class DirectionFunctions(NamedTuple):
     cap_of_row: Any  # Mean direction of a row, cosine and sine of the angle to its farthest; cosine -1 if it may be any
     load_directions: Any  # Fills the directions and caps of a tile's rows
     meets: Any  # Whether a Gaussian's cap meets that of a row
+    dots: Any  # Scalar products of a row's directions with a vector
+    falloff: Any  # Factors of a Gaussian's opacity
 
 
 @cache
-def direction_functions(dtype) -> DirectionFunctions:
-    """Return what both kernels do with directions."""
+def direction_functions(dtype, exp_squarings: int) -> DirectionFunctions:
+    """Return what both kernels do with directions; exp_squarings: see row_functions()."""
+    _, broadcast, heaviside, exponential, _ = row_functions(dtype, exp_squarings)
     g = geometry(dtype)
     real, vec3, vec4, size, lanes = g.real, g.vec3, g.vec4, TILE_SIZE, LANES
     row, cap_of_row = vector(LANES, dtype), vector(5, dtype)
@@ -76,7 +79,19 @@ def direction_functions(dtype) -> DirectionFunctions:
         middle = cap[0] * other[0] + cap[1] * other[1] + cap[2] * other[2]
         return other[3] < real(0.0) or middle >= cosine * other[3] - sine * other[4] - real(1.0e-6)
 
-    return DirectionFunctions(cap_of_row, load_directions, meets)
+    @wp.func
+    def dots(row_directions: wp.array3d(dtype=row), index: int, at: int, other: vec3) -> row:
+        across = row_directions[index, 0, at] * other[0] + row_directions[index, 1, at] * other[1]
+        return across + row_directions[index, 2, at] * other[2]
+
+    @wp.func
+    def falloff(squared: row, forward: row) -> row:
+        """Return factors of opacity: 0 behind the viewer and below exp(-18), as in sphere.py."""
+        depth = wp.max(wp.cw_mul(forward, forward), broadcast(real(1.0e-30)))
+        p = wp.cw_div(squared, depth) * real(-0.5)
+        return wp.cw_mul(exponential(p), wp.cw_mul(heaviside(forward), heaviside(p + broadcast(real(18.0)))))
+
+    return DirectionFunctions(cap_of_row, load_directions, meets, dots, falloff)
 
 
 @cache
@@ -95,10 +110,10 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
         accumulated: scratch, [indices, C, 32] rows.
         image, transmittance, ends: as of blend() in sphere.py; [H W, C], [H W], [H W].
     """
-    row, broadcast, heaviside, exponential, _ = row_functions(dtype, exp_squarings)
+    row, broadcast, heaviside, _, _ = row_functions(dtype, exp_squarings)
+    cap_of_row, load_directions, meets, dots, falloff = direction_functions(dtype, exp_squarings)
     g = geometry(dtype)
     real, vec3, vec4, size, lanes = g.real, g.vec3, g.vec4, TILE_SIZE, LANES
-    cap_of_row, load_directions, meets = direction_functions(dtype)
 
     @wp.kernel(module="unique", module_options=row_options(dtype))
     def blend_forward(
@@ -140,21 +155,13 @@ def forward_kernel(dtype, channels: int, exp_squarings: int):
             last = wp.where(opacity > alpha_threshold, rows, 0)  # Others may have features that are not finite.
             for at in range(last):
                 if meets(cap, cosine, sine, row_caps[index, at]):
-                    dx = row_directions[index, 0, at]
-                    dy = row_directions[index, 1, at]
-                    dz = row_directions[index, 2, at]
-                    forward = dx * cap[0] + dy * cap[1] + dz * cap[2]
-                    u = dx * a[0] + dy * a[1] + dz * a[2]
-                    v = dx * b[0] + dy * b[1] + dz * b[2]
-                    squared = wp.cw_mul(u, u) + wp.cw_mul(v, v)
-                    depth = wp.max(wp.cw_mul(forward, forward), broadcast(real(1.0e-30)))
-                    p = wp.cw_div(squared, depth) * real(-0.5)
-                    # As in falloff() of sphere.py: nothing behind the viewer, and nothing below exp(-18).
-                    shown = wp.cw_mul(heaviside(forward), heaviside(p + broadcast(real(18.0))))
-                    alpha = wp.min(exponential(p) * opacity, broadcast(real(ALPHA_MAX)))
+                    forward = dots(row_directions, index, at, vec3(cap[0], cap[1], cap[2]))
+                    u = dots(row_directions, index, at, a)
+                    v = dots(row_directions, index, at, b)
+                    value = falloff(wp.cw_mul(u, u) + wp.cw_mul(v, v), forward)
+                    alpha = wp.min(value * opacity, broadcast(real(ALPHA_MAX)))
                     t = tile_transmittance[index, at]
                     eligible = wp.cw_mul(heaviside(alpha - broadcast(alpha_threshold)), heaviside(t))
-                    eligible = wp.cw_mul(eligible, shown)
                     weight = wp.cw_mul(wp.cw_mul(alpha, t), eligible)
                     goes_on = heaviside(t - weight - broadcast(real(TRANSMITTANCE_MIN)))
                     weight = wp.cw_mul(weight, goes_on)
@@ -203,10 +210,10 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
         sums: scratch, [indices, C] rows.
         grad_intersections: [M, C + 10] of cap direction, across, along (3 each), opacity, features; begins as zeros.
     """
-    row, broadcast, heaviside, exponential, _ = row_functions(dtype, exp_squarings)
+    row, broadcast, heaviside, _, _ = row_functions(dtype, exp_squarings)
+    cap_of_row, load_directions, meets, dots, falloff = direction_functions(dtype, exp_squarings)
     g = geometry(dtype)
     real, vec3, vec4, size, lanes = g.real, g.vec3, g.vec4, TILE_SIZE, LANES
-    cap_of_row, load_directions, meets = direction_functions(dtype)
 
     @wp.kernel(module="unique", module_options=row_options(dtype))
     def blend_backward(
@@ -278,21 +285,15 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
             last_row = wp.where(opacity > alpha_threshold, rows, 0)
             for at in range(last_row):
                 if meets(cap, cosine, sine, row_caps[index, at]):
-                    dx = row_directions[index, 0, at]
-                    dy = row_directions[index, 1, at]
-                    dz = row_directions[index, 2, at]
-                    forward = dx * cap[0] + dy * cap[1] + dz * cap[2]
-                    u = dx * a[0] + dy * a[1] + dz * a[2]
-                    v = dx * b[0] + dy * b[1] + dz * b[2]
+                    forward = dots(row_directions, index, at, vec3(cap[0], cap[1], cap[2]))
+                    u = dots(row_directions, index, at, a)
+                    v = dots(row_directions, index, at, b)
                     squared = wp.cw_mul(u, u) + wp.cw_mul(v, v)
-                    depth = wp.max(wp.cw_mul(forward, forward), broadcast(real(1.0e-30)))
-                    p = wp.cw_div(squared, depth) * real(-0.5)
-                    shown = wp.cw_mul(heaviside(forward), heaviside(p + broadcast(real(18.0))))
-                    value = exponential(p)
+                    value = falloff(squared, forward)
                     unclamped = value * opacity
                     alpha = wp.min(unclamped, broadcast(real(ALPHA_MAX)))
-                    contributes = wp.cw_mul(heaviside(alpha - broadcast(alpha_threshold)), shown)
-                    contributes = wp.cw_mul(contributes, heaviside(last_contributor[index, at] - order))
+                    not_behind = heaviside(last_contributor[index, at] - order)
+                    contributes = wp.cw_mul(heaviside(alpha - broadcast(alpha_threshold)), not_behind)
                     inverse = wp.cw_div(ones, ones - alpha)
                     t = tile_transmittance[index, at]
                     # As an addition: t * inverse would round each of many faint factors the same way.
@@ -316,6 +317,9 @@ def backward_kernel(dtype, channels: int, exp_squarings: int):
                     from_axis = wp.cw_mul(wp.cw_div(squared, safe), slope)
                     from_u = wp.cw_mul(slope, u)
                     from_v = wp.cw_mul(slope, v)
+                    dx = row_directions[index, 0, at]
+                    dy = row_directions[index, 1, at]
+                    dz = row_directions[index, 2, at]
                     axis_x += wp.cw_mul(from_axis, dx)
                     axis_y += wp.cw_mul(from_axis, dy)
                     axis_z += wp.cw_mul(from_axis, dz)

@@ -23,7 +23,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from .errors import InputError, SehdrError
-from .json_values import shown
+from .json_values import description_of
 from .own_files import first_unlisted, list_file, list_folder
 
 _REFUSALS = "ENOSPC EDQUOT EFBIG EROFS EACCES EPERM EIO ENAMETOOLONG ENOTDIR EISDIR EMFILE"
@@ -193,7 +193,7 @@ def read_json(path: Path, limit: int = MAX_JSON_BYTES) -> dict:
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not valid JSON ({error})", "export the file again") from None
     if not isinstance(values, dict):
-        raise InputError(path, f"holds {shown(values)}, not an object", "export the file again")
+        raise InputError(path, f"holds {description_of(values)}, not an object", "export the file again")
     return values
 
 

@@ -17,7 +17,7 @@ _OF_LIBRARIES = re.compile(
 )
 
 
-def shown(value: Any) -> str:
+def description_of(value: Any) -> str:
     """Return what messages call a value: itself in up to 40 characters, null, `a list of N` or `an object`."""
     if isinstance(value, list):
         return f"a list of {len(value)}"
@@ -29,14 +29,14 @@ def shown(value: Any) -> str:
 def json_object(value: Any, name: str) -> dict[str, Any]:
     """Return a value that is an object; raise ValueError for any other."""
     if not isinstance(value, dict):
-        raise ValueError(f"{name} is {shown(value)}, not an object")
+        raise ValueError(f"{name} is {description_of(value)}, not an object")
     return value
 
 
 def json_list(value: Any, name: str) -> list[Any]:
     """Return a value that is a list; raise ValueError for any other."""
     if not isinstance(value, list):
-        raise ValueError(f"{name} is {shown(value)}, not a list")
+        raise ValueError(f"{name} is {description_of(value)}, not a list")
     return value
 
 
@@ -44,7 +44,7 @@ def text(values: dict[str, Any], name: str, absent: Any = _NEEDED) -> str:
     """Return a field that is a text or a number, as text; `absent` where it is missing, if that is set."""
     value = values[name] if absent is _NEEDED else values.get(name, absent)
     if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise ValueError(f"{name} is {shown(value)}, not a text")
+        raise ValueError(f"{name} is {description_of(value)}, not a text")
     return str(value)
 
 
@@ -59,14 +59,14 @@ def number(values: dict[str, Any], name: str, absent: Any = _NEEDED) -> float:
             return float(value)
     except (ValueError, OverflowError):
         pass
-    raise ValueError(f"{name} is {shown(value)}, not a number")
+    raise ValueError(f"{name} is {description_of(value)}, not a number")
 
 
 def whole_number(values: dict[str, Any], name: str) -> int:
     """Return a field that is a whole number."""
     value = values[name]
     if isinstance(value, bool) or not isinstance(value, int | float) or not -_WHOLE <= value <= _WHOLE or value % 1:
-        raise ValueError(f"{name} is {shown(value)}, not a whole number")
+        raise ValueError(f"{name} is {description_of(value)}, not a whole number")
     return int(value)
 
 
@@ -94,12 +94,14 @@ def numbers(values: dict[str, Any], name: str, *shape: int) -> "np.ndarray":
 def _misfit(value: Any, shape: tuple[int, ...]) -> str:
     """Return what stands in a field in place of numbers [shape]."""
     if not isinstance(value, list):
-        return f"is {shown(value)}"
+        return f"is {description_of(value)}"
     flat = _flat(value)
     odd = next((each for each in flat if isinstance(each, bool | str | dict)), None)
     if odd is not None:
-        return f"holds {shown(odd)}"
-    return f"is {shown(value)}" if -1 in shape or len(flat) == math.prod(shape) else f"holds {len(flat)} numbers"
+        return f"holds {description_of(odd)}"
+    if -1 in shape or len(flat) == math.prod(shape):
+        return f"is {description_of(value)}"
+    return f"holds {len(flat)} numbers"
 
 
 def _flat(value: Any) -> list[Any]:

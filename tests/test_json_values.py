@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from sehdr_warp.json_values import damage, json_list, json_object, number, numbers, shown, text, whole_number
+from sehdr_warp.json_values import damage, description_of, json_list, json_object, number, numbers, text, whole_number
 
 RAGGED = [[1, 2], [3]]
 
@@ -13,7 +13,7 @@ RAGGED = [[1, 2], [3]]
     [(None, "null"), (True, "true"), (1.5, "1.5"), ("x", "'x'"), ([1, 2], "a list of 2"), ({"a": 1}, "an object")],
 )
 def test_values_are_called_as_json_writes_them(value, words):
-    assert shown(value) == words
+    assert description_of(value) == words
     for read in (json_object, json_list):
         if not isinstance(value, dict if read is json_object else list):
             with pytest.raises(ValueError, match=f"^scale is {words}, not a"):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from ..json_values import json_list, shown, whole_number
+from ..json_values import description_of, json_list, whole_number
 from ..output.cameras.paths import interpolate
 from ..scene import Camera
 from .connections import Connection
@@ -28,7 +28,7 @@ def choice(request: dict, field: str, names: Sequence[str]) -> str:
     """Return a field of a request that is one of some names; raise Refusal for any other value."""
     value = request.get(field)
     if value not in names:
-        raise Refusal(400, f"{field} is {shown(value)}, not one of {', '.join(names)}")
+        raise Refusal(400, f"{field} is {description_of(value)}, not one of {', '.join(names)}")
     return str(value)
 
 

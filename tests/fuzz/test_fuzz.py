@@ -65,7 +65,7 @@ OF_PYTHON = re.compile(
 
 
 def is_json(data: bytes) -> bool:
-    """Whether the content of a file is JSON."""
+    """Return whether the content of a file is JSON."""
     return data[:1] in (b"{", b"[")
 
 

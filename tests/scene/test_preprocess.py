@@ -73,7 +73,7 @@ def test_transparent_pixels_show_black_light(tmp_path):
 @pytest.mark.parametrize("derived", [False, True])
 @pytest.mark.parametrize("alpha", [None, 1.0, 0.0])
 def test_transparent_pixels_of_openexr_pictures_show_black_light(tmp_path, derived, alpha):
-    """As photos, and as truth that photos are computed from."""
+    """Pictures are photos here, or truth that photos are computed from."""
     write_blender(tmp_path, camera_angle_x=0.7)
     light = np.random.default_rng(0).uniform(0.1, 1, (30, 40, 4)).astype(np.float32)
     light[..., 3] = 1

@@ -10,7 +10,7 @@ from statistics import median
 
 from ...errors import InputError
 from ...files import has_file, read_bytes, unique_keys
-from ...json_values import damage, json_object, shown, text
+from ...json_values import damage, description_of, json_object, text
 from ...subsets import counted, first_names
 from ..dataparser import ImageRecord
 from ..file_names import lies_at, plain_path
@@ -140,7 +140,7 @@ def parse_seconds(value, source: Path, field: str, unit: str = "") -> float:
     seconds = parse_number(f"{value}{unit}")
     if isinstance(value, bool) or seconds is None or not SHORTEST <= seconds <= LONGEST:
         remedy = 'state seconds above zero, such as 0.008 or "1/125"'
-        raise InputError(source, f"exposure time of {field!r:.90} is {shown(value)}", remedy)
+        raise InputError(source, f"exposure time of {field!r:.90} is {description_of(value)}", remedy)
     return seconds
 
 

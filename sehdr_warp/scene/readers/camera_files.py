@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import InputError, path_of
 from ...files import read_json, read_text
-from ...json_values import damage, number, numbers, shown, text, whole_number
+from ...json_values import damage, description_of, number, numbers, text, whole_number
 from ..camera import Camera
 from ..dataparser import pose_from_camera_to_world
 from ..file_names import natural_key
@@ -101,7 +101,7 @@ def _cameras(path: Path, entries: list, read) -> list[tuple[str, Camera]]:
     cameras = []
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            problem = f"camera {i} is {shown(entry)}, not an object"
+            problem = f"camera {i} is {description_of(entry)}, not an object"
             raise InputError(path, problem, "state its size, focal lengths and pose by name, or give another file")
         try:
             cameras.append(read(entry, i))
