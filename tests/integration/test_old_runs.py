@@ -34,7 +34,10 @@ def test_a_run_of_version_0_3_renders_exports_and_resumes(tmp_path):
     assert (run / "checkpoints" / "iteration_00000024").is_dir()
 
 
-FIELDS = ["loss.clipped_lift", "mcmc.prune_near_points", "mcmc.prune_near_angle", "densification.prune_angle"]
+FIELDS = [
+    *("loss.clipped_lift", "mcmc.prune_near_points", "mcmc.prune_near_angle", "densification.prune_angle"),
+    "model.background",
+]
 
 
 @pytest.mark.parametrize("field", FIELDS)
