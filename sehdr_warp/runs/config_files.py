@@ -200,14 +200,20 @@ def _warn_of_gone_field(file: Path, path: str, value: str) -> None:
 
 
 def field_and_problem(validation: ValidationError) -> tuple[str, str]:
-    """Return the path of the first wrong field, and `field = value: what is allowed` or a similar known field."""
+    """Return the path of the first wrong field, and `field = value: what is allowed` or a similar known field.
+
+    A field that is missing has no value, and a table with entries is `{...}`.
+    """
     error = validation.errors()[0]
     path, value = ".".join(str(part) for part in error["loc"] if isinstance(part, str)), error["input"]
+    if error["type"] == "missing":
+        return path, f"{path} is missing"
     unknown = error["type"] == "extra_forbidden"
     if unknown and isinstance(value, dict) and value:
         name, value = next(iter(value.items()))
         path += f".{name}"
-    value = f"{path or 'the config'} = {reprlib.repr(value)}"
+    text = "{...}" if isinstance(value, dict) and value else reprlib.repr(value)
+    value = f"{path or 'the config'} = {text}"
     if path in GONE or path in RENAMED:
         return path, value
     names = _RENAMED_VALUES.get(path, {})

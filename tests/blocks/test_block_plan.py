@@ -145,6 +145,24 @@ def test_plans_that_cannot_be(tmp_path, plan, fields):
         BlockPlan.read(tmp_path / "run")
 
 
+@pytest.mark.parametrize(
+    "change, problem",
+    [
+        (lambda values: values.pop("base_time"), "base_time is missing"),
+        (lambda values: values["blocks"][0].pop("views"), "blocks.views is missing"),
+        (lambda values: values["normalization"].pop("unit"), "normalization.unit is missing"),
+        (lambda values: values.update(scene=dict(values)), "scene = {...}: input should be a valid string"),
+    ],
+)
+def test_a_field_that_is_missing_is_named_without_what_is_there(tmp_path, plan, change, problem):
+    path = tmp_path / "run" / FILE
+    with edited_json(path) as values:
+        change(values)
+    with pytest.raises(InputError) as error:
+        BlockPlan.read(tmp_path / "run")
+    assert str(error.value) == f"{path}: {problem}; train again, with overwrite=True"
+
+
 def test_more_blocks_than_can_be(tmp_path, plan):
     path = tmp_path / "run" / FILE
     with edited_json(path) as values:
