@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import path_of, require_loaded
+from ..errors import InputError, path_of, require_loaded
 from ..files import atomic_path, check_absent
 from ..kernels.constants import EPS2D, FRUSTUM_MARGIN, NEAR_PLANE
 from ..model.baking import field_of, gaussians_of
@@ -43,15 +43,17 @@ def write_scene_page(
 
     Args:
         run: From load_run, train or load_splats.
-        path: The file.
+        path: The file, of the suffix .html.
         edits: What the page leaves out; by default Gaussians too faint to be drawn.
         overwrite: Replace a file that exists.
 
     Raises:
-        InputError: If the file exists (unless overwrite), or a value is not finite.
+        InputError: For another suffix, if the file exists (unless overwrite), or a value is not finite.
     """
     require_loaded("load_run", run)
     path = path_of(path, "path")
+    if path.suffix.lower() != ".html":  # By which browsers know a page
+        raise InputError(path, f"{path.suffix or 'no suffix'} is not the suffix of a page", "use .html")
     if not isinstance(edits, SplatEdits | None):
         raise TypeError(f"edits is a {type(edits).__name__}, expected SplatEdits, such as SplatEdits(min_views=2)")
     check_absent(path, overwrite)
