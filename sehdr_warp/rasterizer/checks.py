@@ -144,6 +144,14 @@ def check_position(position: Tensor) -> None:
         raise ValueError(f"position is {numbers}, expected finite numbers")
 
 
+def check_matrices(**matrices: Tensor) -> None:
+    """Raise ValueError for matrices [..., M, M] on the CPU that are not finite, with the index of the first."""
+    for name, tensor in matrices.items():
+        if tensor.device.type == "cpu" and not (finite := tensor.detach().isfinite().all(-1).all(-1)).all():
+            index = ", ".join(map(str, (~finite).nonzero()[0].tolist()))
+            raise ValueError(f"{name}[{index}] has a number that is not finite, expected finite numbers")
+
+
 def check_order_axis(axis: Tensor) -> None:
     """Raise ValueError for an axis [3] on the CPU that has no direction."""
     if axis.device.type == "cpu" and not (all(map(math.isfinite, numbers := axis.detach().tolist())) and any(numbers)):

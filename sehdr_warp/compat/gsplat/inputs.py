@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ...rasterizer.checks import check_memory, check_tensors, integer
+from ...rasterizer.checks import check_matrices, check_memory, check_tensors, integer
 from .harmonics import HIGHEST_DEGREE, check_count, evaluate
 
 UNSUPPORTED = {
@@ -131,7 +131,8 @@ def split_views(
         is_shared = isinstance(backgrounds, Tensor) and backgrounds.ndim == 1  # All that gsplat 1.5 takes if packed.
         shapes["backgrounds"] = (backgrounds, (channels,) if is_shared else (*batch, "C", channels))
     check_tensors(**shapes)
-    check_memory(means=means)
+    check_memory(means=means, viewmats=viewmats, Ks=Ks)
+    check_matrices(viewmats=viewmats, Ks=Ks)
     if covars is not None:  # gsplat reads the upper triangle alone, so only that gets a gradient.
         covars = covars.flatten(-2)[..., (0, 1, 2, 1, 4, 5, 2, 5, 8)].unflatten(-1, (3, 3))
     if colors is not None and sh_degree is not None:

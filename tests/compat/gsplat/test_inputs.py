@@ -119,6 +119,20 @@ def test_no_gaussians_and_cameras_that_are_singular_show_the_background(device):
         assert torch.equal(colors, background[:, None, None].expand_as(colors))
 
 
+@pytest.mark.parametrize("name", ["viewmats", "Ks"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_cameras_that_are_not_finite_are_named(name, value):
+    leaves, place = scene("cpu")
+    bad = getattr(place, name).clone()
+    bad[1, 0, 2] = value
+    for model in ("pinhole", "fisheye"):
+        arguments = place._replace(**{name: bad})._asdict() | {"camera_model": model}
+        with pytest.raises(
+            ValueError, match=rf"^{name}\[1\] has a number that is not finite, expected finite numbers$"
+        ):
+            rasterization(*leaves, **arguments)
+
+
 def test_sizes_of_nothing_and_opacities_beyond_one_are_gsplats(device):
     leaves, place = scene(device)
     with torch.no_grad():
