@@ -235,12 +235,12 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
         compensation = result.compensation
         log.info("plan: %s: %s (%s)", result.decision.name, result.decision.choice, result.decision.reason)
     compensated = scene if compensation is None else compensation.normalize_photos(scene, response)
-    views = [replace(view, camera=_camera_of_training(view, data.get("max_size"))) for view in scene.train_views]
-    shared = SharedDecisions(base_time_of(compensated), compensation, _antialiased(views, config))
+    full = [_camera_of_training(view, data.get("max_size")) for view in scene.train_views]
+    shared = SharedDecisions(base_time_of(compensated), compensation, _antialiased(full, config))
     cameras = [view.camera for view in scene.train_views]
     points = _places(compensated, response, device)
     if count is None:
-        count = blocks_for(len(views), sum(view.camera.pixel_count for view in views), config)
+        count = blocks_for(len(full), sum(camera.pixel_count for camera in full), config)
         division = largest_count(scene.name, cameras, points, count) if count > 1 else None
         if division is None:
             reason = "its photos do not show different places" if count > 1 else "its photos are few enough"
@@ -262,7 +262,7 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
         _blocks(scene, division, points),
     )
     sizes = ", ".join(str(len(own)) for own in division.photos)
-    log.info("plan: blocks: %d, with %s of %d training photos", len(plan.blocks), sizes, len(views))
+    log.info("plan: blocks: %d, with %s of %d training photos", len(plan.blocks), sizes, len(full))
     return plan
 
 
@@ -313,9 +313,9 @@ def _camera_of_training(view: View, max_size: int | None) -> Camera:
     return camera.resized(round(scale * camera.width), round(scale * camera.height))
 
 
-def _antialiased(views: Sequence[View], config: Config) -> bool:
+def _antialiased(cameras: Sequence[Camera], config: Config) -> bool:
     """Return model.antialiased for a set, as the plan of one training decides it."""
-    decision = antialiasing(focal_ratio(perspective_cameras(views)), config)
+    decision = antialiasing(focal_ratio(perspective_cameras(cameras)), config)
     if not decision.fields or not config.plan.enabled or "model.antialiased" in config.plan.keep:
         return config.model.antialiased
     log.info("plan: antialiasing: %s (%s)", decision.choice, decision.reason)

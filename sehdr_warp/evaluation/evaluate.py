@@ -166,14 +166,12 @@ class Evaluation:
 
     def _render(self, view: View) -> tuple[Tensor, Any]:
         """Return prediction and truth, [H, W, 3] float32 on the device each; the truth may be None."""
-        size = (view.camera.height, view.camera.width, 3)
         prediction = self.predictions.hdr(view).detach()
-        for what, image in (("photo", view.codes), ("HDR truth", view.hdr), ("picture", prediction)):
-            if image is not None and tuple(image.shape) != size:
-                sizes = f"its {what} is {image.shape[1]} x {image.shape[0]}, its camera {size[1]} x {size[0]}"
-                reduced = what == "picture" and image.shape[1] < size[1]
-                remedy = "take both at one size" + ": --max-size reduces the truth" * reduced
-                raise SehdrError(f"view {view.name!r}: {sizes}; {remedy}")
+        if tuple(prediction.shape) != view.codes.shape:
+            (height, width), (photo_height, photo_width) = prediction.shape[:2], view.codes.shape[:2]
+            sizes = f"its picture is {width} x {height}, its photo {photo_width} x {photo_height}"
+            remedy = "take both at one size" + ": --max-size reduces the truth" * (width < photo_width)
+            raise SehdrError(f"view {view.name!r}: {sizes}; {remedy}")
         if not bool(torch.isfinite(prediction).all()):
             raise SehdrError(f"view {view.name!r}: the render holds values that are not finite; the training diverged")
         return prediction.float(), self._tensor(view.hdr)

@@ -108,10 +108,13 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self):
-        """Check the values and copy the pose."""
+        """Check the values, copy the pose, and make Python's numbers of those of arrays and tensors."""
         for name in ("width", "height", "fx", "fy", "cx", "cy"):
-            if not hasattr(value := getattr(self, name), "__float__"):
+            value = getattr(self, name)
+            if not hasattr(value, "__float__") or getattr(value, "shape", ()):
                 raise TypeError(f"{name} is {value!r:.60}, expected a number")
+            if not isinstance(value, int | float):
+                object.__setattr__(self, name, float(value))
         pose = self.world_to_camera
         if hasattr(pose, "detach"):  # A tensor, perhaps with a gradient or of a GPU
             pose = pose.detach().cpu().numpy()  # pyright: ignore[reportAttributeAccessIssue]
@@ -136,6 +139,7 @@ class Camera:
         if not _are_numbers(self.distortion, (count,)):
             problem = f"distortion is {self.distortion!r:.60}, expected {count} finite numbers"
             raise ValueError(f"{problem}, as {self.projection} has")
+        object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths ({self.fx}, {self.fy}) are not positive")
         if min(self.fx, self.fy) < MIN_FOCAL or max(self.fx, self.fy) > MAX_FOCAL:

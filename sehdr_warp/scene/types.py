@@ -1,8 +1,11 @@
 """Views, and the scene that they form."""
 
+from collections import Counter
 from dataclasses import dataclass
+from math import inf
+from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +14,8 @@ from .camera import Camera
 if TYPE_CHECKING:
     from ..response import Response
     from .lens import Lens
+
+SPLITS = "train", "test"
 
 
 @dataclass(frozen=True, repr=False)
@@ -36,7 +41,9 @@ class View:
         uncertain: whether structure from motion placed the camera by few points.
 
     Raises:
-        ValueError: if codes have another type or shape; codes_of returns codes for encoded values.
+        TypeError: for a field of another type.
+        ValueError: for an array of another type or size than stated here, and for a value out of range. Pixels are not
+            read; codes_of returns codes for encoded values.
     """
 
     name: str
@@ -54,14 +61,42 @@ class View:
     uncertain: bool = False
 
     def __post_init__(self):
-        """Check the types and shapes."""
-        codes = self.codes
+        """Check types, shapes and ranges; pixels are not read."""
+        if not isinstance(self.name, str):
+            raise TypeError(f"name of a view is {self.name!r:.60}, expected text")
+        codes, camera = self.codes, self.camera
         if getattr(codes, "dtype", None) not in (np.uint8, np.uint16) or codes.ndim != 3 or codes.shape[2] != 3:
-            problem = f"{getattr(codes, 'dtype', type(codes).__name__)} {list(getattr(codes, 'shape', ()))}"
-            raise ValueError(f"codes of view {self.name} are {problem}, not uint8 or uint16 [H, W, 3]; see codes_of")
-        if self.light_above_white is not None and self.light_above_white.shape != codes.shape:
-            problem = list(self.light_above_white.shape)
-            raise ValueError(f"light_above_white of view {self.name} is {problem}, its codes are {list(codes.shape)}")
+            raise ValueError(f"{self._field('codes')}, not uint8 or uint16 [H, W, 3]; see codes_of")
+        if not isinstance(camera, Camera):
+            raise TypeError(f"{self._field('camera')}, expected a Camera")
+        if codes.shape[:2] != (camera.height, camera.width):
+            size = f"its codes {codes.shape[1]} x {codes.shape[0]}; see Camera.resized"
+            raise ValueError(f"camera of view {self.name} is of {camera.width} x {camera.height} pixels, {size}")
+        if not isinstance(self.exposure_time, Real):
+            raise TypeError(f"{self._field('exposure_time')}, expected a number of seconds")
+        if not 0 < self.exposure_time < inf:
+            raise ValueError(f"{self._field('exposure_time')}, expected seconds above 0; without known times, give 1")
+        if self.split not in SPLITS:
+            raise ValueError(f"{self._field('split')}, expected 'train' or 'test'")
+        for name, kind, shape in (
+            ("mask", np.float32, codes.shape[:2]),
+            ("hdr", np.float32, codes.shape),
+            ("light_above_white", np.float16, codes.shape),
+        ):
+            array = getattr(self, name)
+            if array is not None and not (
+                isinstance(array, np.ndarray) and (array.dtype, array.shape) == (kind, shape)
+            ):
+                expected = f"a NumPy array {np.dtype(kind)} {list(shape)}, as its codes have pixels"
+                raise ValueError(f"{self._field(name)}, expected {expected}")
+        if self.source is not None and not isinstance(self.source, Path):
+            raise TypeError(f"{self._field('source')}, expected a pathlib.Path")
+        if self.orientation not in range(1, 9):
+            raise ValueError(f"{self._field('orientation')}, expected EXIF's, 1 to 8")
+
+    def _field(self, name: str) -> str:
+        """Return what messages say of a field: its name, the view and its value."""
+        return f"{name} of view {self.name} is {_description_of(getattr(self, name))}"
 
     def __repr__(self) -> str:
         """Return name, size, split and exposure time in one line."""
@@ -100,6 +135,11 @@ class Scene:
         color_matrix: [3, 3] from the primaries of the codes' light to linear Rec.709; None if these are Rec.709.
         unplaced: number of photos without a camera, which are in no view.
         black_background: True if photos have transparent parts that count as black light, as those of rendered sets do.
+
+    Raises:
+        TypeError: for views that are no tuple or list of Views.
+        ValueError: for two views of one name, points or colors of another shape or that are not finite, and a color
+            matrix of another shape.
     """
 
     name: str
@@ -117,6 +157,34 @@ class Scene:
     unplaced: int = 0
     black_background: bool = False
 
+    def __post_init__(self):
+        """Check the types and shapes, and make a tuple of a list of views."""
+        if not isinstance(self.views, tuple | list):
+            raise TypeError(f"views of scene {self.name} is {_description_of(self.views)}, expected a tuple of Views")
+        for view in self.views:
+            if not isinstance(view, View):
+                raise TypeError(f"views of scene {self.name} has {_description_of(view)}, expected Views")
+        object.__setattr__(self, "views", tuple(self.views))
+        name, count = next(iter(Counter(view.name for view in self.views).most_common(1)), ("", 0))
+        if count > 1:
+            raise ValueError(f"views of scene {self.name} has {count} views named {name!r}; give each its own name")
+        points, colors = self.points, self.point_colors
+        for field, array in (("points", points), ("point_colors", colors)):
+            if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind != "f":
+                raise ValueError(f"{field} of scene {self.name} is {_description_of(array)}, expected floats [P, 3]")
+        if len(points) != len(colors):
+            counts = f"{len(colors)} point_colors for {len(points)} points"
+            raise ValueError(f"scene {self.name} has {counts}; give each point a color")
+        if not (finite := np.isfinite(points).all(1)).all():
+            row = int(np.argmin(finite))
+            raise ValueError(f"point {row} of scene {self.name} is {points[row].tolist()}; leave it and its color out")
+        if not (colors.min(initial=0) >= 0 and colors.max(initial=1) <= 1):
+            limits = f"{colors.min():g} to {colors.max():g}"
+            raise ValueError(f"point_colors of scene {self.name} are {limits}, not in [0, 1]; divide codes by 255")
+        if self.color_matrix is not None and np.shape(self.color_matrix) != (3, 3):
+            matrix = _description_of(self.color_matrix)
+            raise ValueError(f"color_matrix of scene {self.name} is {matrix}, expected [3, 3]")
+
     def __repr__(self) -> str:
         """Return name, format, number of views and their size in one line."""
         sizes = sorted({view.codes.shape[1::-1] for view in self.views})
@@ -132,6 +200,13 @@ class Scene:
     def test_views(self) -> tuple[View, ...]:
         """The views held out for testing."""
         return tuple(view for view in self.views if view.split == "test")
+
+
+def _description_of(value: Any) -> str:
+    """Return what messages call a value: type and shape of an array, else the value in up to 60 characters."""
+    if hasattr(value, "dtype") and hasattr(value, "shape"):
+        return f"{value.dtype} {list(value.shape)}"
+    return f"a {type(value).__name__} of {len(value)}" if isinstance(value, tuple | list) else f"{value!r:.60}"
 
 
 def encoded_values(codes: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ counts by its solid angle. What compares photos by pinhole cameras (matching poi
 that are cut from them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -143,12 +143,12 @@ def perspective_views(views: Sequence[View]) -> tuple[View, ...]:
     return tuple(face for view in views for face in ((view,) if view.camera.is_pinhole else faces_of(view)))
 
 
-def perspective_cameras(views: Sequence[View]) -> list[Camera]:
+def perspective_cameras(cameras: Iterable[Camera]) -> list[Camera]:
     """Return the cameras of perspective_views(), those of faces with few pixels, without seconds of resampling."""
-    cameras: list[Camera] = []
-    for camera in (view.camera for view in views):
-        cameras += [camera] if camera.is_pinhole else [face.camera for face in face_cameras(camera, _COARSE)]
-    return cameras
+    pinholes: list[Camera] = []
+    for camera in cameras:
+        pinholes += [camera] if camera.is_pinhole else [face.camera for face in face_cameras(camera, _COARSE)]
+    return pinholes
 
 
 def faces_of(view: View, size: int | None = None) -> list[View]:
@@ -173,7 +173,7 @@ def faces_of(view: View, size: int | None = None) -> list[View]:
             weights *= map_coordinates(mask, np.stack([rows, columns]), order=0, mode="nearest")
         part = None if weights.min() >= 1 else weights
         codes = codes_of(codes, 8 if view.codes.dtype == np.uint8 else 16)
-        name = f"{view.name}_{face.number}"
+        name = f"{view.name}//{face.number}"  # No photo has such a name, as no path has two slashes.
         faces.append(
             replace(view, name=name, codes=codes, camera=face.camera, mask=part, hdr=None, light_above_white=None)
         )

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from numbers import Real
 
 import numpy as np
 import torch
@@ -232,36 +231,15 @@ def make_matcher(scene: Scene, response: Response, device: torch.device | str, d
 
 def depth_of_points(scene: Scene) -> float:
     """Return the median depth of the points in the training views, or focus_distance() if these are too few."""
-    cameras, points = perspective_cameras(scene.train_views), every_nth(scene.points, MOST_DEPTHS)
+    cameras = perspective_cameras(view.camera for view in scene.train_views)
+    points = every_nth(scene.points, MOST_DEPTHS)
     homogeneous = np.c_[points, np.ones(len(points))]
     depths = np.concatenate([homogeneous[each.project(points).inside] @ each.world_to_camera[2] for each in cameras])
     return float(np.median(depths)) if len(depths) >= FEWEST_POINTS else focus_distance(cameras)
 
 
 def check_views(scene: Scene) -> None:
-    """Raise InputError for a scene with too few views, or whose photos are all black or white.
-
-    Likewise for values that a scene built in code may have: photos of another size than their camera's, times, splits
-    and points that cannot be.
-    """
-    for view in scene.views:
-        height, width = view.codes.shape[:2]
-        if (width, height) != (view.camera.width, view.camera.height):
-            size = f"{view.camera.width} x {view.camera.height}"
-            remedy = "give each photo a camera of its size, as view.camera.resized(width, height)"
-            raise InputError(scene.name, f"view {view.name} is {width} x {height}, its camera {size}", remedy)
-        if not (isinstance(view.exposure_time, Real) and 0 < view.exposure_time < math.inf):
-            problem = f"view {view.name} has exposure_time = {view.exposure_time!r:.40}"
-            raise InputError(scene.name, problem, "give seconds above 0; 1 for all if none are known")
-        if view.split not in ("train", "test"):
-            raise InputError(scene.name, f"view {view.name} has split = {view.split!r:.40}", "give train or test")
-    points, colors = np.shape(scene.points), np.shape(scene.point_colors)
-    if len(points) != 2 or points[1] != 3 or colors != points:
-        problem = f"points and point_colors have shapes {list(points)} and {list(colors)}, not both [P, 3]"
-        raise InputError(scene.name, problem, "give a color for each point, or no points")
-    if len(colors) and not np.asarray(scene.point_colors).max(initial=0) <= 1:
-        problem = f"point_colors reach {np.asarray(scene.point_colors).max():g}, not encoded values in [0, 1]"
-        raise InputError(scene.name, problem, "divide codes by 255")
+    """Raise InputError for a scene with too few views, or whose photos are all black or white."""
     views = scene.train_views
     if len(views) < 2:
         remedy = "a scene needs at least two photos from different places"

@@ -102,7 +102,7 @@ def is_large(scene: Scene) -> bool:
 
     The figure is the mean fraction of the sampled points that a training photo contains, occlusion not considered.
     """
-    cameras = perspective_cameras(scene.train_views)
+    cameras = perspective_cameras(view.camera for view in scene.train_views)
     return float(_in_view(cameras, _sample_points(scene, cameras, 0)[0]).mean()) < LARGE_SCENE
 
 

@@ -1,5 +1,7 @@
 """Cameras that cannot be are refused when they are made."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +51,7 @@ def test_limited_size():
         ({"width": "8"}, "width is '8', expected a number"),
         ({"fx": None}, "fx is None, expected a number"),
         ({"cy": [1, 2]}, r"cy is \[1, 2\], expected a number"),
+        ({"height": np.array([6, 8])}, r"height is array\(\[6, 8\]\), expected a number"),
         ({"world_to_camera": "eye"}, "world_to_camera is not a finite 4 x 4 matrix"),
         ({"world_to_camera": [[1, 2], [3]]}, "world_to_camera is not a finite 4 x 4 matrix"),
         ({"world_to_camera": np.diag([1e200, 1, 1, 1])}, "rotation of world_to_camera is not a proper rotation"),
@@ -62,6 +65,14 @@ def test_values_of_another_type_are_named(values, words):
     known = {"width": 8, "height": 6, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0, "world_to_camera": np.eye(4)}
     with pytest.raises((TypeError, ValueError), match=words):
         Camera(**known | values)
+
+
+def test_numbers_of_arrays_and_tensors_make_a_camera_that_json_holds():
+    expected = Camera(8, 6, 5.0, 5.0, 4.0, 3.0, np.eye(4), "OPENCV_FISHEYE", (0.5, 0.0, 0.0, 0.0))
+    distortion = np.array([0.5, 0, 0, 0], np.float32)
+    for K in (torch.tensor([[5.0, 0, 4], [0, 5, 3]]), np.array([[5, 0, 4], [0, 5, 3]], np.float32)):
+        camera = Camera(8, 6, K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.eye(4), "OPENCV_FISHEYE", distortion)
+        assert json.dumps(camera.to_dict()) == json.dumps(expected.to_dict())
 
 
 def test_a_pose_that_is_trained_makes_a_camera():

@@ -57,7 +57,7 @@ def test_cameras_at_one_place_take_the_unit_from_the_points():
     scene = ring(shift=np.array([3.0, 0, 0]), radius=0.0)
     distance = np.median(np.linalg.norm(scene.points - scene.views[0].camera.position, axis=1))
     assert normalization_of(scene).unit == pytest.approx(POINT_SHARE * distance)
-    assert normalization_of(replace(scene, points=np.zeros((0, 3)))).unit == 1.0
+    assert normalization_of(replace(scene, points=scene.points[:0], point_colors=scene.point_colors[:0])).unit == 1.0
 
 
 @pytest.mark.parametrize("center, unit", [((0, 0, np.nan), 1.0), ((0, 0), 1.0), ((0, 0, 0), 0.0), ((0, 0, 0), np.inf)])

@@ -128,43 +128,6 @@ def test_a_lamp_does(tmp_path, device):
     assert true > 20 and mean > 8
 
 
-SIZE = "view .* is 8 x 6, its camera .*; give each photo a camera of its size"
-
-
-@pytest.mark.parametrize(
-    "changes, words",
-    [
-        ({"codes": np.full((6, 8, 3), 9, np.uint8)}, SIZE),
-        ({"exposure_time": 0.0}, "has exposure_time = 0.0; give seconds above 0"),
-        ({"exposure_time": "1/125"}, "has exposure_time = '1/125'; give seconds above 0"),
-        ({"split": "val"}, "has split = 'val'; give train or test"),
-    ],
-)
-def test_a_view_built_in_code_that_cannot_be_is_named(tmp_path, changes, words):
-    scene = wall_and_lamp()
-    views = (replace(scene.views[0], **changes), *scene.views[1:])
-    with pytest.raises(InputError, match=words):
-        train(replace(scene, views=views), tmp_path / "run", SHORT, device="cpu")
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    "points, colors, words",
-    [
-        (np.zeros((5, 2)), np.zeros((5, 3)), r"shapes \[5, 2\] and \[5, 3\], not both \[P, 3\]"),
-        (np.zeros((5, 3)), np.zeros((4, 3)), r"shapes \[5, 3\] and \[4, 3\], not both"),
-        (
-            np.random.default_rng(0).random((5, 3)),
-            np.full((5, 3), 200, np.uint8),
-            "point_colors reach 200, not encoded",
-        ),
-    ],
-)
-def test_points_built_in_code_that_cannot_be_are_named(tmp_path, points, colors, words):
-    with pytest.raises(InputError, match=words):
-        train(replace(wall_and_lamp(), points=points, point_colors=colors), tmp_path / "run", SHORT, device="cpu")
-
-
 @pytest.mark.parametrize(
     "count, options, words",
     [

@@ -208,7 +208,7 @@ def read_ply_points(path: Path) -> PointCloud:
 
 
 def _checked_points(points: np.ndarray, colors: np.ndarray, path: Path) -> PointCloud:
-    good = np.isfinite(points).all(axis=1)
+    good = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
     if not good.all():
         _log.warning(
             "%s: %d of %d points are not finite and are left out", path, len(points) - int(good.sum()), len(points)

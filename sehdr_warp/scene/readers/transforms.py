@@ -308,6 +308,8 @@ def _points(folder: Path, path: Path, values: dict) -> PointCloud:
     scale = values.get("applied_scale")
     if isinstance(scale, int | float) and 0 < scale < np.inf:
         points = points * float(scale)
+    if not np.isfinite(points).all():
+        raise InputError(path, "applied_transform and applied_scale move points to infinity", _REMEDY)
     return PointCloud(points, colors)
 
 

@@ -76,6 +76,17 @@ def test_an_empty_file_of_points_has_none(tmp_path, file):
     assert len(load(tmp_path).points) == 0
 
 
+def test_points_whose_color_is_no_number_are_left_out(tmp_path, caplog):
+    write_colmap(tmp_path)
+    for path in (tmp_path / "sparse" / "0").glob("points3D.*"):
+        path.unlink()
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "red", "green", "blue"))
+    header = f"ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n"
+    (tmp_path / "sparse" / "0" / "points3D.ply").write_text(f"{header}1 2 3 0.5 0.5 0.5\n4 5 6 nan 0 0\n")
+    assert load(tmp_path).points.tolist() == [[1, 2, 3]]
+    assert "1 of 2 points are not finite" in caplog.text
+
+
 def test_text_models_of_scripts(tmp_path):
     """Indented comments, sizes and colors as floats, models in lower case."""
     write_colmap(tmp_path)

@@ -61,6 +61,13 @@ def test_nerfstudio_points_move_with_the_poses(tmp_path):
     np.testing.assert_allclose(sorted(load(tmp_path).points.tolist()), expected)
 
 
+def test_points_that_a_scale_moves_to_infinity_are_refused(tmp_path):
+    write_blender(tmp_path, applied_scale=1.7e308)
+    write_colmap(tmp_path / "colmap")
+    with pytest.raises(InputError, match=r"transforms.json: applied_transform and applied_scale move points to inf"):
+        load(tmp_path)
+
+
 def test_poses_of_mitsuba_have_x_to_the_left_and_z_ahead(tmp_path):
     write_blender(tmp_path, 3)
     frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
