@@ -235,12 +235,13 @@ class Evaluation:
 
 
 def _inside(pair: tuple[Tensor, Tensor], mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return prediction and truth with the prediction set to the truth outside the mask.
+    """Return prediction and truth with the prediction set to the truth where the mask is 0.
 
-    Windows across the border of the mask then contain no error from outside.
+    Windows across the border of the mask then contain no error from outside. What has a part of the weight, such as a
+    pixel near the pole of a panorama, is weighed by the metrics alone.
     """
     prediction, truth = pair
-    return (prediction if mask is None else torch.lerp(truth, prediction, mask[..., None].to(truth))), truth
+    return (prediction if mask is None else torch.where(mask[..., None] > 0, prediction, truth)), truth
 
 
 def _mean(rows: list[dict], *names: str) -> dict[str, float | None]:

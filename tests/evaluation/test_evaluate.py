@@ -162,6 +162,20 @@ def test_what_cannot_be_evaluated_is_said():
         evaluate(run(lambda hdr: hdr * float("nan")), scene(VIEWS))
 
 
+def test_pixels_of_part_of_the_weight_count_by_it():
+    """As those of a panorama do by their solid angles."""
+    weights = np.full((24, 30), 1.0, np.float32)
+    weights[:12] = 0.25
+    photo = np.full((24, 30, 3), 0.5, np.float32)
+    views = [view(0, "train"), view(1, "test", mask=weights, photo=photo, truth=False)]
+    wrong = torch.tensor(photo)
+    wrong[:12] += 0.1
+    evaluated = run()
+    evaluated.render_ldr = lambda camera, seconds: wrong
+    error = 0.25 * 0.1**2 / (0.25 + 1)
+    assert evaluate(evaluated, scene(views))["ldr"]["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
+
+
 def test_confidence_is_ranked_against_errors():
     plain = evaluate(run(lambda hdr: hdr / 2.1), scene(VIEWS))["confidence"]
     assert plain["spearman_log2"] is None and "not measured" in plain["reason"]
