@@ -7,7 +7,8 @@ import torch
 
 from ..evaluation.metrics import decibels, squared_error
 from ..runs.run import Run
-from ..scene import Camera, View
+from ..scene import View
+from ..scene.wide_camera import surface_points
 from .division import Division
 
 NEAR = 0.5  # Distance from a border, in mean margins of the blocks, within which a pixel shows the border
@@ -39,7 +40,9 @@ def measure_seams(run: Run, views: tuple[View, ...], division: Division, depths:
         photo = torch.tensor(view.image, device=run.device)
         prediction = run.render_ldr(view.camera, view.exposure_time)
         depth = (depths or run).render(view.camera).depth.cpu().numpy()
-        at_border = (division.border_distance(_places(view.camera, depth)) < near).reshape(depth.shape) & (depth > 0)
+        at_border = (division.border_distance(surface_points(view.camera, depth).reshape(-1, 3)) < near).reshape(
+            depth.shape
+        ) & (depth > 0)
         mask = np.ones(depth.shape) if view.mask is None else view.mask
         total = np.zeros(2)
         for row, part in enumerate((at_border, ~at_border)):
@@ -51,9 +54,3 @@ def measure_seams(run: Run, views: tuple[View, ...], division: Division, depths:
     border, elsewhere = (decibels(error / weight) if weight else float("nan") for error, weight in sums)
     share = float(sums[0, 1] / max(sums[:, 1].sum(), 1e-12))
     return SeamErrors(float(np.mean(each)) if each else float("nan"), border, elsewhere, share)
-
-
-def _places(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Return the points [H W, 3] of scene coordinates at the depths [H, W] of a pinhole camera's pixels."""
-    row, column = np.mgrid[: camera.height, : camera.width] + 0.5
-    return camera.unproject(column.ravel(), row.ravel(), depth.ravel())

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import SehdrError, did_you_mean
 from ..scene import Camera
-from ..scene.wide_camera import pixel_directions
+from ..scene.wide_camera import pixel_rays, surface_points
 from .images.exr import Part, as_data
 from .world_transform import WorldTransform
 
@@ -60,7 +60,7 @@ Channels = Mapping[str, Any]
 def _depth(images: ViewImages) -> Channels:
     """Return Z and the distance from the camera; 0 where nothing is."""
     depth = images.depth
-    return {"Z": depth, "distance.Z": depth * np.linalg.norm(_rays(images.camera), axis=2)}
+    return {"Z": depth, "distance.Z": depth * np.linalg.norm(pixel_rays(images.camera), axis=2)}
 
 
 def _position(images: ViewImages) -> Channels:
@@ -117,16 +117,6 @@ def data_parts(names: Sequence[str], images: ViewImages, attributes: Mapping[str
     return [Part(AOVS[name](images), as_data(attributes), name) for name in names]
 
 
-def _rays(camera: Camera) -> np.ndarray:
-    """Return [H, W, 3] rays in camera axes, 1 long along the camera's own axis; unit vectors for a wide camera."""
-    if not camera.is_pinhole:
-        return np.nan_to_num(pixel_directions(camera))
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2)
-
-
 def _points(images: ViewImages) -> np.ndarray:
     """Return [H, W, 3] coordinates of the visible surface in the file; 0 where nothing is."""
-    camera, depth = images.camera, images.depth[..., None]
-    points = (_rays(camera) * depth) @ camera.world_to_camera[:3, :3] + camera.position
-    return np.where(depth > 0, points, 0)
+    return np.where(images.depth[..., None] > 0, surface_points(images.camera, images.depth), 0)

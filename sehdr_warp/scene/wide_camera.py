@@ -28,6 +28,23 @@ def pixel_directions(camera: Camera) -> np.ndarray:
     return _directions(camera.width, camera.height, camera.projection, tuple(camera.intrinsics), camera.distortion)
 
 
+def pixel_rays(camera: Camera) -> np.ndarray:
+    """Return [H, W, 3] float64 rays in camera axes, by which a render's depths become places.
+
+    Those of a pinhole are 1 long along its axis, as depths are measured along it. Those of a wide camera are unit
+    vectors, as its depths are distances; 0 where its lens shows nothing.
+    """
+    if not camera.is_pinhole:
+        return np.nan_to_num(pixel_directions(camera))
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=2)
+
+
+def surface_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Return world points [H, W, 3] at the depths [H, W] of a render."""
+    return (pixel_rays(camera) * depth[..., None]) @ camera.world_to_camera[:3, :3] + camera.position
+
+
 @lru_cache(maxsize=4)
 def _directions(width: int, height: int, projection: str, intrinsics: tuple, distortion: tuple) -> np.ndarray:
     columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)

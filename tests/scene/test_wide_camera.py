@@ -1,12 +1,13 @@
 """Panoramas and wide fisheye lenses: where their pixels look, what they count, and how they are loaded."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.scene import load_scene
+from sehdr_warp.scene import load_scene, look_at
 from sehdr_warp.scene.camera import Camera
 from sehdr_warp.scene.lens import Lens
 from sehdr_warp.scene.types import View, codes_of
@@ -17,6 +18,7 @@ from sehdr_warp.scene.wide_camera import (
     pixel_directions,
     pixels_of_directions,
     solid_angles,
+    surface_points,
 )
 
 WIDTH, HEIGHT = 128, 64
@@ -45,6 +47,20 @@ def test_pixels_and_directions_are_inverse(camera):
     np.testing.assert_allclose(
         places[inside], np.stack(np.mgrid[: camera.height, : camera.width], 2)[inside], atol=1e-4
     )
+
+
+@pytest.mark.parametrize("camera", [panorama(), fisheye()], ids=["panorama", "fisheye"])
+def test_depths_of_wide_cameras_are_distances_and_those_of_pinholes_lie_along_the_axis(camera):
+    camera = replace(camera, world_to_camera=look_at((1, 2, 3), (0, 0, 1)))
+    depth = np.full((camera.height, camera.width), 2.5)
+    offsets = surface_points(camera, depth) - camera.position
+    shown = np.isfinite(pixel_directions(camera)).all(2)
+    np.testing.assert_allclose(np.linalg.norm(offsets, axis=2), np.where(shown, 2.5, 0))
+    np.testing.assert_allclose(offsets[shown], 2.5 * (pixel_directions(camera) @ camera.world_to_camera[:3, :3])[shown])
+    pinhole = replace(camera, projection="pinhole", distortion=())
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    expected = pinhole.unproject(x.ravel(), y.ravel(), depth.ravel()).reshape(offsets.shape)
+    np.testing.assert_allclose(surface_points(pinhole, depth), expected)
 
 
 def test_a_lens_shows_nothing_beyond_its_widest_angle():

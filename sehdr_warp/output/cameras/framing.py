@@ -10,6 +10,7 @@ import numpy as np
 
 from ...scene import Camera
 from ...scene.camera_focus import common_focus
+from ...scene.wide_camera import surface_points
 from ...subsets import evenly
 from ..world_transform import scene_up
 from .paths import look_at_pose, moved, orbit, walk, walk_path
@@ -164,5 +165,5 @@ def visible_surface(run: "RenderableScene", camera: Camera, least_alpha: float =
     """Return points [N, 3] of the surface that a camera shows, and their radiance [N, 3]."""
     rendered = run.render(camera, supersample=False)
     depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
-    row, column = np.nonzero((depth > 0) & (alpha > least_alpha))
-    return camera.unproject(column + 0.5, row + 0.5, depth[row, column]), rendered.hdr.cpu().numpy()[row, column]
+    shown = (depth > 0) & (alpha > least_alpha)
+    return surface_points(camera, depth)[shown], rendered.hdr.cpu().numpy()[shown]

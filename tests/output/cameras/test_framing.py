@@ -5,6 +5,7 @@ from sehdr_warp.output.cameras.framing import (
     default_path,
     frame_subject,
     subject_radius,
+    visible_surface,
     widescreen_camera,
     widescreen_size,
 )
@@ -49,6 +50,24 @@ def test_the_subject_fits_into_every_picture(tmp_path):
         alpha = np.asarray(run.render(each.within(96)).alpha)
         assert max(alpha[0].max(), alpha[-1].max()) < 0.5 and 0.15 < alpha.mean() < 0.6
     assert len({round(each.fx, 6) for each in framed}) == 1
+
+
+@pytest.mark.parametrize(
+    "wide",
+    [("equirectangular", 128, 64, 128 / (2 * np.pi), ()), ("OPENCV_FISHEYE", 96, 96, 30.0, (0.0, 0.0, 0.0, 0.0))],
+    ids=["panorama", "fisheye"],
+)
+def test_wide_photos_show_surfaces_where_they_are(tmp_path, wide):
+    run = ball(tmp_path)
+    projection, width, height, focal, distortion = wide
+    middle = width / 2, height / 2
+    for target in ((0, 0, 0), (0, 0, 3)):  # The ball is in the middle of the picture, and beside it.
+        pose = look_at((3, -1, 0), target, up=(0, -1, 0))
+        camera = Camera(width, height, focal, focal, *middle, pose, projection, distortion)
+        points, light = visible_surface(run, camera, 0.9)
+        assert len(points) > 20 and light.shape == points.shape
+        assert (abs(np.linalg.norm(points, axis=1) - 1) < 0.2).mean() > 0.95
+        assert (points @ [3, -1, 0] > 0).mean() > 0.95, "the side that faces the camera"
 
 
 def test_a_path_shows_little_more_than_its_photos(tmp_path):
