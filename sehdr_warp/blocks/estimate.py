@@ -8,6 +8,7 @@ import torch
 from ..parallel import thread_count
 from ..runs.config import Config
 from ..runs.config_files import override_config
+from ..subsets import counted
 from ..training.cost import Choice, Workload, choices, cpu_cost, recommend
 from ..training.initialization import start_count
 from ..training.plan import STEPS_PER_PHOTO, Plan
@@ -37,7 +38,7 @@ def estimate(plan: Plan, requested: Config, device: torch.device, gpus: int = 1)
         memory = float(torch.cuda.get_device_properties(device).total_memory)
         return choices(whole, divided, blocks, memory, gpus), recommend(whole, divided, blocks, memory, gpus)
     threads = thread_count()
-    here = Choice(f"CPU, {threads} threads", cpu_cost(whole, threads))
+    here = Choice(f"CPU, {counted(threads, 'thread', 'threads')}", cpu_cost(whole, threads))
     others = [replace(each, name=f"{each.name} (H100)") for each in choices(whole, divided, blocks, None, gpus)]
     recommended = (
         recommend(whole, divided, blocks, None) if blocks > 1 else "this machine, or one GPU if that takes too long"

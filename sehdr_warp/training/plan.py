@@ -19,6 +19,7 @@ from ..runs.config_files import as_config, override_config
 from ..runs.device import pick_device
 from ..scene import Scene
 from ..scene.photos import FEWEST_PHOTOS
+from ..subsets import counted
 from .cost import cpu_seconds
 from .hdr_truth import largest_hdr_truth
 from .initialization import base_time_of, start_count
@@ -297,7 +298,8 @@ def _iterations(facts: SceneFacts, config: Config, device: torch.device) -> Deci
         most = max(CPU_FEWEST, in_a_minute, min(sharp, most))
         if number > most:
             number, seconds = most, most * step
-            reason = f"about {format_duration(seconds)} on a CPU with {thread_count()} threads; --iterations for more"
+            threads = counted(thread_count(), "thread", "threads")
+            reason = f"about {format_duration(seconds)} on a CPU with {threads}; --iterations for more"
             if seconds > 2 * CPU_SECONDS:
                 reason += ", --max-size for smaller photos and less time"
         if round(number / facts.photos) < CPU_STEPS_PER_PHOTO:

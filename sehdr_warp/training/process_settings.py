@@ -15,6 +15,7 @@ from ..parallel import thread_count
 from ..rasterizer.memory import return_freed_memory
 from ..rasterizer.precompile import precompiled, training_kernels
 from ..runs.config import Config
+from ..subsets import counted
 
 SWITCH_SECONDS = 2e-4  # Interval after which a waiting thread requests the interpreter's lock; Python's 5 ms are long
 
@@ -26,7 +27,8 @@ _blocks_lock = threading.Lock()
 def machine_figures(device: torch.device) -> dict:
     """Return the device's name and the peak memory in bytes, of this process and of torch's tensors on a GPU."""
     cuda = device.type == "cuda"
-    figures: dict = {"device": torch.cuda.get_device_name(device) if cuda else f"cpu ({thread_count()} threads)"}
+    cpu = f"cpu ({counted(thread_count(), 'thread', 'threads')})"
+    figures: dict = {"device": torch.cuda.get_device_name(device) if cuda else cpu}
     if sys.platform != "win32":
         import resource
 

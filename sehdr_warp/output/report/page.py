@@ -94,13 +94,14 @@ def _header(run: Run, scene: Scene, picture: Markup) -> Markup:
     """Return title, first picture and figures of the training."""
     summary, last = run.summary(), next((line for line in reversed(run.metrics()) if "psnr_ldr" in line), {})
     camera = max((view.camera for view in scene.views), key=attrgetter("pixel_count"))
+    of_one_size = len({view.codes.shape for view in scene.views}) == 1
     times = sorted({view.exposure_time for view in scene.train_views or scene.views})
     span = " to ".join(shutter(time) for time in sorted({times[0], times[-1]})).replace(" s to", " to")
     exposure = "exposure" if run.exposure_compensation is None else "exposure, compensated"
     facts = {
         "photos trained on": len(scene.train_views),
         "photos held out": len(scene.test_views),
-        "pixels each": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
+        f"pixels {'each' if of_one_size else 'at most'}": f"{camera.width} \N{MULTIPLICATION SIGN} {camera.height}",
         exposure: span.replace(" s", "\N{NO-BREAK SPACE}s"),
         "response": run.response.name,
         "Gaussians": f"{run.gaussian_count:,}".replace(",", SPACE),
@@ -271,15 +272,15 @@ def _boxed_photo(image: np.ndarray, name: str, regions: Sequence[Mapping]) -> Ma
         left, top, wide, high = region["box"]
         color = "#ffb454" if region["stops"] > 0 else "#6cc7e8"
         x, y, w, h = left - 3 * unit, top - 3 * unit, wide + 6 * unit, high + 6 * unit
-        rect = (
-            '<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="none" stroke="{}" stroke-width="{:.2f}"/>'
-        )
+        rect = '<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="none" stroke="{}" '
+        rect += 'stroke-width="{:.2f}"/>'
         boxes.append(markup(rect, x, y, w, h, color, 1.6 * unit))
         text = '<text x="{:.1f}" y="{:.1f}" style="fill:{};font-size:{:.1f}px;font-weight:600;paint-order:stroke;'
         text += 'stroke:#000;stroke-width:{:.2f}px">{}</text>'
         baseline = y + h + 14 * unit if y < 16 * unit else y - 5 * unit
         stops = stops_text(region["stops"]).removesuffix(" EV")
-        boxes.append(markup(text, min(x, width - 60 * unit), baseline, color, 15 * unit, 2.4 * unit, stops))
+        left = min(max(x, 3 * unit), width - 60 * unit)  # Whole letters, although boxes may reach beyond the photo
+        boxes.append(markup(text, left, baseline, color, 15 * unit, 2.4 * unit, stops))
     source = jpeg_source(jpeg(smaller(image, _PICTURE), 84))
     return markup(
         '<svg viewBox="0 0 {width} {height}" role="img" aria-label="unexplained regions of {name}">'
@@ -295,8 +296,8 @@ def _boxed_photo(image: np.ndarray, name: str, regions: Sequence[Mapping]) -> Ma
 def _plan(decisions: Sequence[Mapping]) -> Markup:
     rows = [(d["name"], d["choice"], d.get("reason", "")) for d in decisions]
     return _section(
-        "What was left out, and why",
-        "Decided before the training, from the photos.",
+        "What was decided, and why",
+        "Before the training, from the photos.",
         _rows(("", "choice", "why"), rows),
     )
 

@@ -32,6 +32,9 @@ EVALUATION = {
 }
 
 
+REGION = {"column": 1.0, "row": 7.0, "pixels": 9, "stops": 1.25, "box": [0, 6, 3, 3]}
+
+
 def page(tmp_path, *, unexplained=True, **options):
     run, scene = make(tmp_path, **options)
     named = {"photo": "v_0", "column": 5.0, "row": 7.0, "pixels": 9, "stops": 1.25}
@@ -51,12 +54,28 @@ def test_the_page_is_valid_alone_and_complete(tmp_path):
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", text) and "url(" not in text
     assert len(text) < 5e6
     expected = ["Light above white", "Photo, scene, truth", "Brackets", "Confidence", "What stays unexplained"]
-    assert headings(text) == [*expected, "What was left out, and why", "Figures", "PSNR over time", "Cameras"]
+    assert headings(text) == [*expected, "What was decided, and why", "Figures", "PSNR over time", "Cameras"]
     assert "<li>a note of <code>the training</code></li>" in text
     assert text.index("<h2>Light above white") < text.index('class="facts"') < text.index("<h2>Photo, scene, truth")
     for checked in ("plain &lt;scaling&gt;", "31.40", "25.0%", "26.0 dB", "65 s", "+1.2<", "\N{MINUS SIGN}2<"):
         assert checked in text
     assert '<rect x="3.8" y="5.8"' in text  # Around the box, by three units of a 32-pixel photo
+
+
+def test_photos_of_several_sizes_are_so_called_and_letters_at_the_border_are_whole(tmp_path):
+    run, scene = make(tmp_path)
+    view = scene.views[0]
+    height, width = view.codes.shape[:2]
+    assert f"pixels each<b>{width} \N{MULTIPLICATION SIGN} {height}<" in page(tmp_path / "one")
+    small = replace(view, camera=view.camera.resized(8, 6), codes=view.codes[:6, :8], hdr=None)
+    run.summary = lambda: {"unexplained": {"regions": 1, "photos": 1, "worst": [REGION | {"photo": "v_1"}]}}
+    scene = replace(scene, views=(small, *scene.views[1:]))
+    text = write_report(run, scene, tmp_path / "two", evaluation=EVALUATION)[0].read_text()
+    assert f"pixels at most<b>{width} \N{MULTIPLICATION SIGN} {height}<" in text
+    box, letters = re.search(
+        r'<rect x="(.*?)" .*?<text x="(.*?)"', text[text.index("unexplained regions of") :]
+    ).groups()
+    assert float(box) < 0 < float(letters)
 
 
 def test_lights_are_listed_with_what_is_certain_of_them(tmp_path, monkeypatch):
