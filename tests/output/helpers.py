@@ -17,6 +17,7 @@ from sehdr_warp.runs.run import load_splats
 from sehdr_warp.scene import Camera, Scene, View, codes_of, look_at
 from sehdr_warp.scene.dataparser import PlacedPhoto
 from sehdr_warp.scene.images.hdr_files import read_exr_channels
+from sehdr_warp.scene.wide_camera import pixel_rays
 from sehdr_warp.splats import GaussianArrays, write_gaussians
 
 
@@ -105,11 +106,8 @@ class AnalyticRun:
     def render(self, view, *, supersample=True, data=()):
         self.rendered += 1
         y, x = np.mgrid[: view.height, : view.width] + 0.5
-        rays = (
-            np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], 2)
-            @ view.world_to_camera[:3, :3]
-        )
-        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        rays = pixel_rays(view) @ view.world_to_camera[:3, :3]
+        rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-9)
         hdr = self.gain * np.exp(6 * rays - 2 * rays[..., :1]) * 0.1
         rendered = rendered_view(hdr, np.full(x.shape, 0.75), 2 + x * 0 + y * 1e-4)
         return replace(rendered, **{name: getattr(self, f"render_{name}")(view) for name in data})

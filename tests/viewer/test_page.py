@@ -5,7 +5,7 @@ import pytest
 
 from sehdr_warp.output.images.display import display_gain, encode_srgb
 from sehdr_warp.output.notebook import run_html
-from sehdr_warp.scene import Camera
+from sehdr_warp.scene import Camera, View, codes_of
 
 from ..output.helpers import AnalyticRun, read_exr
 from .browser import browser, page_of, pixels
@@ -135,6 +135,43 @@ def test_looks_overlays_and_the_photo_beside(chromium, serve):
         page.select_option("#overlay", "none")
         settle(page, lambda: page.select_option("#left", "run1"))
         page.check("#frusta")
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        (512, 256, 512 / (2 * np.pi), "equirectangular", ()),
+        (300, 300, 120.0, "OPENCV_FISHEYE", (0.05, -0.02, 0.0, 0.001)),
+        (300, 300, 100.0, "SIMPLE_RADIAL_FISHEYE", (-0.1,)),
+    ],
+    ids=["panorama", "fisheye", "fisheye-with-an-end"],
+)
+def test_wide_photos_are_compared_with_where_they_show_it(chromium, serve, lens):
+    width, height, focal, projection, distortion = lens
+    photos = {}
+    server = serve(photos=lambda index: photos)
+    run = server.viewer.runs[0].run
+    for entry in run.cameras:
+        pose = entry.camera.world_to_camera
+        entry.camera = Camera(width, height, focal, focal, width / 2, height / 2, pose, projection, distortion)
+        image = run.response.encode(run.render(entry.camera).hdr.numpy() * entry.exposure_time)
+        photos[entry.name] = View(entry.name, codes_of(image, 8), entry.camera, entry.exposure_time, entry.split)
+    with page_of(chromium, server.url) as page:
+        page.wait_for_selector(FULL)
+        settle(page, lambda: page.select_option("#view", "1"))
+        scene = pixels(page, "#picture")
+        page.select_option("#left", "photo")
+        rest(page)
+        left = slice(0, scene.shape[1] // 2 - 4)
+        beside = pixels(page, "#picture")[:, left]
+        shown = np.abs(beside - 26 / 255).max(axis=2) > 1 / 255
+        assert shown.mean() > (0.5 if projection == "OPENCV_FISHEYE" else 0.999)
+        assert np.abs(beside - scene[:, left])[shown].mean() < 0.02
+        page.select_option("#left", "0")
+        page.select_option("#overlay", "error")
+        rest(page)
+        no_error = np.abs(pixels(page, "#picture")[:, left] - [0.10, 0.09, 0.22]).max(axis=2) < 0.1
+        assert no_error[shown].mean() > 0.9
 
 
 def test_the_tables_are_the_shader(chromium, serve):

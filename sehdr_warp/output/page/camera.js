@@ -101,6 +101,14 @@ function between(from, to) {
   return b.slice(0, 3).flatMap(row => [...[0, 1, 2].map(j => dot(row, a[j])), dot(row, center) + row[3]]).concat([0, 0, 0, 1]);
 }
 const lensOf = c => [c.fx / c.width, c.fy / c.height, c.cx / c.width, c.cy / c.height];
+// How a photo's camera sees, for LightCanvas: its shape (0 pinhole, 1 panorama, 2 fisheye), k1 to k4, and its widest angle.
+function sightOf(c) {
+  if (!c.projection || c.projection === "equirectangular") return {shape: c.projection ? 1 : 0};
+  const bend = [0, 1, 2, 3].map(i => c.distortion[i] || 0), steps = 2048;
+  const radius = t => t * (1 + bend.reduce((sum, k, i) => sum + k * t ** (2 * i + 2), 0));
+  const angles = [...Array(steps).keys()].map(i => i / (steps - 1) * Math.PI), last = angles.findIndex((t, i) => i && radius(t) <= radius(angles[i - 1]));
+  return {shape: 2, bend, reach: last < 0 ? 4 : angles[last - 1]};
+}
 function project(camera, point) {  // Pixels, or null behind
   const m = camera.world_to_camera, [x, y, z] = [0, 1, 2].map(i => dot(m[i], point) + m[i][3]);
   return z > 1e-6 ? [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy] : null;

@@ -174,7 +174,7 @@ function paint() {
   if (!drawn || !facts) return;
   // A photo that is still being read is not compared with.
   const ready = state.photoReady === state.photo, left = $("left").value === "photo" && !ready ? "0" : $("left").value, split = left === "0" ? 0 : state.split, view = facts.views[state.photo];
-  const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera)} : {};
+  const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera), ...sightOf(view.camera)} : {};
   light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value === "error" && !ready ? "none" : $("overlay").value,
               split, left: left === "photo" ? 2 : left === "0" ? 0 : 1, lens: lensOf(drawn.camera), ...photo});
   $("whiteLabel").textContent = stopsText(Number($("white").value));
@@ -206,8 +206,9 @@ function frusta() {
   context.lineWidth = 1.2 * (window.devicePixelRatio || 1);
   facts.views.forEach((view, i) => {
     const c = view.camera, m = c.world_to_camera, center = centerOf(c), size = facts.size * 0.06;
+    const wide = c.projection ? Math.max(1, c.width / 2 / c.fx) : 1;  // The frustum of a wide lens shows 90 degrees.
     const corner = (x, y) => {
-      const ray = [(x - c.cx) / c.fx, (y - c.cy) / c.fy, 1].map(v => v * size);
+      const ray = [(x - c.cx) / c.fx / wide, (y - c.cy) / c.fy / wide, 1].map(v => v * size);
       return project(drawn.camera, [0, 1, 2].map(k => center[k] + m[0][k] * ray[0] + m[1][k] * ray[1] + m[2][k] * ray[2]));
     };
     const apex = project(drawn.camera, center), corners = [corner(0, 0), corner(c.width, 0), corner(c.width, c.height), corner(0, c.height)];
