@@ -22,6 +22,13 @@ from .errors import InputError, UsageError, did_you_mean
 Options = typing.TypeVar("Options")
 MIN_COLUMNS = 40
 """Columns of the narrowest terminal that help tables are laid out for; tyro takes minutes for a narrower one."""
+_OTHER_NAMES = {
+    **dict.fromkeys(("--max-steps", "--steps", "--max-num-iterations", "--num-iterations"), "--iterations"),
+    **dict.fromkeys(("--output-dir", "--output-path", "--result-dir", "--model-path"), "--out"),
+    **dict.fromkeys(("--data-factor", "--downscale-factor", "--resolution"), "--max-size"),
+    "--test-every": "--holdout",
+}
+"""Flags of gsplat, nerfstudio and 3DGS, which no similar spelling leads to, and what stands in their place here."""
 MARKERS = (
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.OmitArgPrefixes,
@@ -79,18 +86,21 @@ def _check_flags(options: type, words: list[str], program: str) -> None:
             raise UsageError(f"{program} {words[0]}: no such command{hint}")
         _check_flags(commands[words[0]], words[1:], f"{program} {words[0]}")
         return
-    names, bare = {"--help", *flags(options)}, {"--" + name for name in positional(options)}
+    names, bare = {"--help", *flags(options)}, {"--" + name: shown for name, shown in positional(options).items()}
+    bare |= {f"--{shown.lower()}": shown for shown in bare.values()}
     removed = getattr(options, "removed_flags", {})
     for word in words:
         flag = word.partition("=")[0].replace("_", "-")
         if not re.match(r"--[a-z]", flag) or flag in names:
             continue
         if flag in bare:
-            raise UsageError(f"{program} takes {flag[2:].upper()} without {flag}; see {program} --help")
+            raise UsageError(f"{program} takes {bare[flag]} without {flag}; see {program} --help")
         if flag in removed:
             raise UsageError(f"{flag} is gone: {removed[flag]}")
         # A mistyped part of a dotted flag (--los.clipping) is similar to the flag; a missing part (--clipping) is not.
         by_field = {name.rpartition(".")[2].removeprefix("--"): name for name in names if "." in name}
+        if (own := _OTHER_NAMES.get(flag)) in names:
+            raise UsageError(f"{program} has no {flag}, did you mean {own}?")
         hint = did_you_mean(flag, names) or (f", did you mean {by_field[flag[2:]]}?" if flag[2:] in by_field else "")
         raise UsageError(f"{program} has no {flag:.80}{hint or f'; see {program} --help'}")
 
@@ -116,7 +126,7 @@ def subcommands(options: type) -> dict[str, type]:
 
 def flags(options: typing.Any) -> Iterator[str]:
     """Yield the flags of options, without those of their subcommands."""
-    bare = set(positional(options))
+    bare = positional(options)
     for name, hint in _hints(options).items():
         kind = _unwrap(hint)
         if name in bare:
@@ -127,9 +137,15 @@ def flags(options: typing.Any) -> Iterator[str]:
             yield "--" + name.replace("_", "-")
 
 
-def positional(options: typing.Any) -> list[str]:
-    """Return the names of the options that stand on a command line without a flag."""
-    return [name for name, hint in _hints(options).items() if tyro.conf.Positional in getattr(hint, "__metadata__", ())]
+def positional(options: typing.Any) -> dict[str, str]:
+    """Return the names of the options that stand on a command line without a flag, each with its name in the help."""
+    shown = {}
+    for name, hint in _hints(options).items():
+        marks = getattr(hint, "__metadata__", ())
+        if tyro.conf.Positional in marks:
+            metavars = (getattr(mark, "metavar", None) for mark in marks)
+            shown[name] = next(filter(None, metavars), name.upper()).removesuffix(" ...")
+    return shown
 
 
 def _mend_help(options: type) -> None:

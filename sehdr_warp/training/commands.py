@@ -192,6 +192,8 @@ def _train(args: Train, ranks: "Ranks | None" = None) -> None:
     folder = RunWriter(out)
     resumes = folder.check_start(resume=output.resume, overwrite=output.overwrite)
     if output.resume and not resumes:
+        if args.data is None:
+            raise SehdrError(f"{out}: holds no run to resume; give SCENE, a folder of photos, to begin one there")
         log.info("%s holds no run yet: a training begins there", out)
     info, saved_config = folder.read_info() if resumes else {}, folder.read_config() if resumes else None
     data, config = _load_arguments(args, info.get("data")), _config(args, saved_config)
