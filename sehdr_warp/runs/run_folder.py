@@ -24,10 +24,12 @@ import json
 import math
 import os
 import re
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
-from ..errors import InputError, SehdrError
+from ..errors import MOST_LISTED, InputError, SehdrError
 from ..files import UnreadableError, has_file, refuse_links
 from ..json_values import damage
 from ..model.confidence import MAX_STOPS, Evidence
@@ -109,7 +111,19 @@ class RunFolder:
                     raise InputError(self.path, problem, "wait for it, or continue with `sehdr-warp train --resume`")
                 problem = "is a file, not a run" if self.path.is_file() else "no such folder"
                 problem = f"is not a run (no {file.name})" if self.path.is_dir() else problem
+                if remedy == _GIVE_RUN and (inner := self._run_within()) is not None:
+                    remedy = f"did you mean {inner}?"
                 raise InputError(self.path, problem, remedy)
+
+    def _run_within(self) -> Path | None:
+        """Return the newest run among the folders in this one, of several trainings for example; None without one."""
+        with suppress(OSError):
+            configs = (entry / self.config_file.name for entry in islice(self.path.iterdir(), MOST_LISTED))
+            runs = [
+                config for config in configs if config.is_file() and (config.parent / self.info_file.name).is_file()
+            ]
+            return max(runs, key=lambda config: config.stat().st_mtime).parent if runs else None
+        return None
 
     def refuse_links(self) -> None:
         """Raise InputError if anything of a run in this folder is a link, whose target is not the run's.

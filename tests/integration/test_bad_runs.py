@@ -36,7 +36,7 @@ RUNS = {
     ),
     "values without iteration": (
         lambda run: remove_value(checkpoint_of(run) / "checkpoint.json", "iteration"),
-        "checkpoint.json: iteration = ",
+        "checkpoint.json: iteration is missing",
     ),
     "no checkpoint": (
         lambda run: shutil.rmtree(run / "checkpoints"),

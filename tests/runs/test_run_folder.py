@@ -1,6 +1,7 @@
 """A run that somebody sent: reading it changes nothing, follows no link, and refuses in one line what does not fit."""
 
 import os
+import shutil
 
 import pytest
 
@@ -45,6 +46,18 @@ def test_a_link_is_refused_even_to_a_sound_file(run, name):
         with pytest.raises(InputError, match="is a link"):
             RunWriter(run).check_start(**how)
     assert files_in(run.parent) == before
+
+
+def test_a_folder_of_runs_is_told_from_a_run_by_naming_the_newest(run):
+    older = run.parent / "older"
+    shutil.copytree(run, older)
+    os.utime(older / "config.json", (1, 1))
+    (run.parent / "notes.txt").touch()
+    with pytest.raises(InputError, match=rf"is not a run \(no config.json\); did you mean {run}\?"):
+        load_run(run.parent)
+    (run / "run.json").unlink()
+    with pytest.raises(InputError, match=rf"did you mean {older}\?"):
+        load_run(run.parent)
 
 
 def test_a_run_whose_replacement_was_interrupted_says_so(run):
