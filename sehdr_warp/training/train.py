@@ -41,15 +41,27 @@ log = logging.getLogger(__name__)
 
 
 def train(
-    scene: Scene, out: Path | str, config: Config | str | Path | Mapping[str, Any] | None = None, **options: Any
+    scene: Scene,
+    out: Path | str,
+    config: Config | str | Path | Mapping[str, Any] | None = None,
+    *,
+    device: str | torch.device | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    tensorboard: bool = False,
+    data: LoadArguments | None = None,
 ) -> Run:
-    """Train a scene to the end.
+    """Train a scene to the end; see create_trainer() for the arguments.
 
     Args:
         scene: A scene from load_scene().
         out: Run folder.
-        config: As in create_trainer().
-        options: The other arguments of create_trainer().
+        config: A preset, or fields that differ from the default one, such as {"schedule.iterations": 500}.
+        device: "cpu", "cuda:0", ...; by default the first GPU, or the CPU if there is none.
+        resume: Continue the run in `out`.
+        overwrite: Replace the run in `out`.
+        tensorboard: Write event files.
+        data: Arguments with which the scene was loaded.
 
     Returns:
         The trained run.
@@ -59,7 +71,8 @@ def train(
         SehdrError: If the training diverges, or the disk or the memory is full.
         KeyboardInterrupt: After a checkpoint was written.
     """
-    return create_trainer(scene, out, config, **options).train()
+    places = {"resume": resume, "overwrite": overwrite, "tensorboard": tensorboard, "data": data}
+    return create_trainer(scene, out, config, device=device, **places).train()
 
 
 def create_trainer(

@@ -109,6 +109,12 @@ def test_options_of_load_scene_that_cannot_be_are_named(options, words):
         sw.load_scene("embedded", **options)
 
 
+def test_options_that_train_does_not_take_are_named_as_its_own(scene, tmp_path):
+    with pytest.raises(TypeError, match=r"train\(\) got an unexpected keyword argument 'iterations'"):
+        sw.train(scene, tmp_path / "x", iterations=5)
+    assert not any(tmp_path.iterdir())
+
+
 def test_compare_runs_takes_a_list(run):
     for value in (run, None):
         with pytest.raises(TypeError, match="expected a list of runs, as load_run"):
