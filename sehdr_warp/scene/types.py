@@ -66,7 +66,7 @@ class View:
             raise TypeError(f"name of a view is {self.name!r:.60}, expected text")
         codes, camera = self.codes, self.camera
         if getattr(codes, "dtype", None) not in (np.uint8, np.uint16) or codes.ndim != 3 or codes.shape[2] != 3:
-            raise ValueError(f"{self._field('codes')}, not uint8 or uint16 [H, W, 3]; see codes_of")
+            raise ValueError(f"{self._field('codes')}, not NumPy's uint8 or uint16 [H, W, 3]; see codes_of")
         if not isinstance(camera, Camera):
             raise TypeError(f"{self._field('camera')}, expected a Camera")
         if codes.shape[:2] != (camera.height, camera.width):
@@ -171,7 +171,8 @@ class Scene:
         points, colors = self.points, self.point_colors
         for field, array in (("points", points), ("point_colors", colors)):
             if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind != "f":
-                raise ValueError(f"{field} of scene {self.name} is {_description_of(array)}, expected floats [P, 3]")
+                problem = f"{field} of scene {self.name} is {_description_of(array)}"
+                raise ValueError(f"{problem}, expected floats [P, 3]; P may be 0")
         if len(points) != len(colors):
             counts = f"{len(colors)} point_colors for {len(points)} points"
             raise ValueError(f"scene {self.name} has {counts}; give each point a color")
