@@ -16,7 +16,7 @@ _log = logging.getLogger("sehdr_warp.scene")
 _temporaries: list[tempfile.TemporaryDirectory] = []
 
 
-def cached_folder(cache: Path | str | None, name: str, fill: Callable[[Path], None]) -> Path:
+def cached_folder(cache: Path | str | None, name: str, what: str, fill: Callable[[Path], None]) -> Path:
     """Return the folder of a result: the cached one, or a new one that fill(folder) writes.
 
     The user's cache is $SEHDR_CACHE, or sehdr-warp/ in $XDG_CACHE_HOME or ~/.cache. If it cannot be written, the result
@@ -25,13 +25,14 @@ def cached_folder(cache: Path | str | None, name: str, fill: Callable[[Path], No
     Args:
         cache: The cache, which must be writable; None for the user's.
         name: Name of the result, which contains a hash of everything that it depends on.
+        what: What the result is, for the user.
         fill: Computes the result and writes its files.
     """
     folder = cache_folder(cache)
     place = (folder or Path()) / name
     if folder and place.is_dir():
         if is_as_listed(place):
-            _log.info("using the cached result %s", place)
+            _log.info("%s: using the cached result %s", what, place)
             return place
         _log.warning("%s is damaged and is made again", place)
         shutil.rmtree(place, ignore_errors=True)

@@ -84,7 +84,7 @@ def with_fitting_cameras(
         (result / "verdict.json").write_text(json.dumps(asdict(_verdict(records, layout, pairs))))
 
     try:
-        place = cached_folder(cache, f"poses-{key}", fill)
+        place = cached_folder(cache, f"poses-{key}", "comparison of the poses with the photos", fill)
     except ImportError:
         return list(records), ["poses: not compared with the photos, because pycolmap is not installed"]
     verdict = _Verdict(**json.loads((place / "verdict.json").read_text()))

@@ -161,7 +161,7 @@ def solved_folder(cache: Path | str | None, key: str, solve: Callable[[Path, Pat
         with tempfile.TemporaryDirectory(prefix="sehdr-sfm-", dir=result) as work:
             solve(Path(work), result)
 
-    return cached_folder(cache, f"sfm-{key}", fill)
+    return cached_folder(cache, f"sfm-{key}", "cameras by structure from motion", fill)
 
 
 def cache_key(*parts) -> str:

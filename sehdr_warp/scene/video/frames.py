@@ -122,7 +122,9 @@ def _subpixel_offset(peak: np.ndarray, pixel: np.ndarray, axis: int) -> float:
 def frames_folder(clip: Clip, cache: Path | str | None = None) -> Path:
     """Return a folder of the chosen frames, made once for a clip's content; `cache` as of cached_folder()."""
     name = f"video-{file_digest(clip.path)[:16]}-{_VERSION}"
-    return cached_folder(cache, name, lambda folder: _write_frames(clip, choose_frames(clip), folder))
+    return cached_folder(
+        cache, name, "frames of the video", lambda folder: _write_frames(clip, choose_frames(clip), folder)
+    )
 
 
 def _write_frames(clip: Clip, choice: FrameChoice, folder: Path) -> None:
