@@ -10,13 +10,16 @@ function turned(v, axis, angle) {  // Rodrigues
   return v.map((x, i) => x * c + w[i] * s + axis[i] * d);
 }
 
+// Of pictures from the place of a panorama or a fisheye photo, which are perspective: 75 degrees of the shorter side.
+const FROM_WIDE = {width: 2, height: 2, fx: 1 / Math.tan(0.6545), fy: 1 / Math.tan(0.6545), cx: 1, cy: 1};
+
 class FlyingCamera {
   constructor(up) { this.up = unit(up); }
 
   // Takes a camera's place; an orbit turns about a point ahead, at the focus of the scene or half its size away.
   jump(camera, {focus, size}) {
     const m = camera.world_to_camera, ahead = focus ? dot(add(focus, centerOf(camera), -1), m[2].slice(0, 3)) : 0;
-    this.lens = camera, this.ahead = ahead > 0 ? ahead : size / 2;
+    this.lens = camera.projection ? FROM_WIDE : camera, this.ahead = ahead > 0 ? ahead : size / 2;
     this.right = m[0].slice(0, 3), this.down = m[1].slice(0, 3), this.forward = m[2].slice(0, 3);
     this.position = centerOf(camera);
   }
