@@ -393,5 +393,7 @@ class RadianceField(nn.Module):
             antialiased=self.antialiased,
             **pixel_filter.wide_options(self, camera, log_scales, opacities, at_place)._asdict(),
         )
+        if (shown := camera.shown) is not None:
+            image, transmittance = image * shown[..., None], 1 - (1 - transmittance) * shown
         none = features.new_zeros(len(features), 2)
         return Rendering(image, transmittance, none, none[:, 0], none, 0)

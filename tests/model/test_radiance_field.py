@@ -1,6 +1,7 @@
 """The field: colour models, tone maps, brackets, exposures, and what a render of them means."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from sehdr_warp.rasterizer import rasterize
 from sehdr_warp.response import response_by_name
 from sehdr_warp.runs.run_folder import CameraEntry
 from sehdr_warp.scene import Camera
+
+from ..training.toy import orbit_camera, toy_field
 
 TIME = 0.25
 SRGB = response_by_name("srgb")
@@ -55,6 +58,20 @@ def test_display_colours_are_encoded_values():
     assert float(field.render(CAMERA).hdr[12, 16, 1]) == pytest.approx(decoded, rel=1e-4)
     brighter = float(SRGB.encode(torch.tensor(decoded * TIME * 1.5)))
     assert float(photograph(field, 1.5 * TIME).encoded.detach()[12, 16, 1]) == pytest.approx(brighter, abs=1e-4)
+
+
+def test_a_fisheye_lens_shows_nothing_beyond_its_border():
+    """theta - 0.1 theta^3 is largest at 105 degrees, 73 pixels from the middle."""
+    wide = Camera(200, 160, 60.0, 60.0, 100.0, 80.0, np.eye(4), "SIMPLE_RADIAL_FISHEYE", (-0.1,))
+    field = toy_field()
+    y, x = np.mgrid[:160, :200] + 0.5
+    radius = np.hypot(x - 100, y - 80)
+    placed = replace(wide, world_to_camera=orbit_camera(0.0, 32).world_to_camera)
+    view, photo = field.render(placed), field.render_ldr(placed).numpy()
+    alpha = view.alpha.numpy()
+    assert alpha[radius < 20].max() > 0.5
+    for picture in (alpha, view.depth.numpy(), view.hdr.numpy().max(2), photo.max(2)):
+        assert not picture[radius > 75].any()
 
 
 def test_a_view_in_place_of_its_camera_is_refused_by_name():
