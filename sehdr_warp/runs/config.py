@@ -134,10 +134,10 @@ class LossConfig(_Table):
     """weight of the mean opacity, which lets unneeded Gaussians fade for mcmc to relocate (3DGS-MCMC); it is 0 from the
     last relocation on and, where a photo shows less than a tenth of the scene, for new Gaussians until a photo shows
     them; more leaves surfaces transparent"""
-    transmittance_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
-    """weight of the mean transmittance of the pixels from the last relocation on: 0.03 makes surfaces opaque, for
-    renders over other pictures, and lets Gaussians at the photos' borders grow; rendered sets with transparent parts
-    that count as black have none"""
+    transmittance_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 1.0
+    """weight of the mean transmittance of the pixels in a twentieth of the steps, after the last relocation; these make
+    surfaces opaque and leave the shapes of the Gaussians; it is less in trainings below 4,000 steps, and 0 for rendered
+    sets whose transparent parts count as black"""
     size_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
     """weight of the mean size of the Gaussians in units of the cameras' radius (3DGS-MCMC), which shrinks those that no
     photo supports, and which can veil new views; it is 0 from the last relocation on, and where a photo

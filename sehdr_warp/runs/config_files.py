@@ -28,7 +28,7 @@ _GONE = tomllib.loads((resources.files("sehdr_warp.runs") / "gone.toml").read_te
 RENAMED: dict[str, str] = _GONE.pop("renamed")  # Fields of version 0.2, each with its name since version 0.3
 GONE: dict[str, str] = {path: advice for advice, paths in _GONE.items() for path in paths}
 """Fields of earlier versions that no longer exist, each with what to do instead."""
-NEW_FIELDS: dict[str, Any] = {"model.order_angle": 0.0}
+NEW_FIELDS: dict[str, Any] = {"model.order_angle": 0.0, "loss.transmittance_weight": 0.0}
 """Fields that runs of earlier versions lack, each with the value that these were trained by."""
 _RENAMED_VALUES = {"densification.strategy": {"relocation": "mcmc", "gradient": "adc"}}
 

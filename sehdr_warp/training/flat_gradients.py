@@ -39,8 +39,6 @@ class FlatGradients:
     def collect(self, loss: Tensor, overflow: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
         """Move the parameters' gradients to the buffer, with the numbers of the step."""
         gradients = {k: value.grad for k, value in enumerate(self.parameters) if value.grad is not None}
-        # Else the mean would hold gradients of an earlier step.
-        assert self._with_gradient in ([], [*gradients]), "all steps have gradients of the same parameters"
         self._with_gradient = [*gradients]
         torch._foreach_copy_([self._views[k] for k in gradients], [*gradients.values()])
         self._degree = None

@@ -35,7 +35,7 @@ from ..runs.run import Run
 from ..scene import Camera, Scene
 from .advice import best_if_overfitted, evaluations
 from .data_manager import DataManager, PhotoSampler
-from .gradient_step import OVERFLOWED, SKIPPED, GradientStep, StepOptions, StepResult
+from .gradient_step import OVERFLOWED, SKIPPED, GradientStep, StepResult
 from .initialization import depth_of_points, make_matcher
 from .matching import Matcher
 from .measured_light import replace_measured
@@ -239,8 +239,7 @@ class Trainer:
         self._view_index = self.sampler.next()
         means_lr = means_rate(self.config, self.iteration, self.batch)
         set_means_rate(self.optimizer, means_lr)
-        refines = not self.strategy.schedule.is_over(self.iteration)
-        options = StepOptions(self.degree, refines, self.strategy.needs_gradients(self.iteration))
+        options = self.gradient_step.options_at(self.iteration, self.degree)
 
         # Forward, loss, backward, optimizer step: GradientStep.run().
         views, next_index = self.data_manager.views, self.sampler.peek()
@@ -249,7 +248,7 @@ class Trainer:
         self.strategy.inject_noise(self.iteration, self.field.gaussians, means_lr)
         if self.strategy.is_due(self.iteration, self.step_batch):
             self._densify()
-        if not refines:
+        if not options.refines:
             self._get_matcher = None  # Its copies of the photos take memory on the device.
         # Moving average; after the last step, it replaces the Gaussians.
         self.average.update(self.iteration, self.step_batch, self.field.gaussians)

@@ -63,12 +63,14 @@ def test_blocks_agree_on_opacity_compensation_whatever_their_photos(plan):
         assert make_plan(toy_scene(), on.config_of(block)).config.model.antialiased
 
 
-def test_plans_without_an_angle_order_along_the_cameras_axes(tmp_path, plan):
+@pytest.mark.parametrize(("table", "field"), [("model", "order_angle"), ("loss", "transmittance_weight")])
+def test_plans_without_new_fields_train_as_earlier_versions_did(tmp_path, plan, table, field):
     file = tmp_path / "run" / FILE
     values = json.loads(file.read_text())
-    del values["config"]["model"]["order_angle"]
+    del values["config"][table][field]
     file.write_text(json.dumps(values))
-    assert plan.config.model.order_angle > BlockPlan.read(tmp_path / "run").config.model.order_angle == 0
+    read = BlockPlan.read(tmp_path / "run").config.model_dump()
+    assert plan.config.model_dump()[table][field] > read[table][field] == 0
 
 
 def test_plans_without_opacity_compensation_have_that_of_their_config(tmp_path, plan):

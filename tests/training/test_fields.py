@@ -30,7 +30,7 @@ FIELDS = [
     ("mcmc", "optimizer.harmonics_rest", 0.01),
     ("mcmc", "densification.prune_opacity", 0.3),
     ("mcmc", "loss.size_weight", 1.0),
-    ("mcmc", "loss.transmittance_weight", 0.1),
+    ("mcmc", "loss.transmittance_weight", 0.0),
     ("mcmc", "mcmc.sharpness_photos", 2),
     ("adc", "densification.prune_opacity", 0.3),
     ("adc", "adc.grow_grad2d", 5e-3),

@@ -9,7 +9,8 @@ from sehdr_warp.model.gaussians import Gaussians, moments_of
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of
-from sehdr_warp.training.gradient_step import Dropout, OrderAxis
+from sehdr_warp.training.gradient_step import Dropout, OrderAxis, opaque_steps
+from sehdr_warp.training.strategies.base import Schedule
 from sehdr_warp.training.trainer import Trainer
 
 from .toy import EXPOSURE_TIME, VARIANTS, make_trainer, quick
@@ -107,22 +108,61 @@ def test_a_turned_camera_shows_what_photos_from_its_place_show(angle):
     assert aside < 6 * wall if angle else aside > 15 * wall
 
 
-@pytest.mark.parametrize(("weight", "transparent"), [(0.03, False), (0.0, False), (0.03, True)])
-def test_surfaces_become_opaque(weight, transparent):
-    """A wall that lets through half of its light fits photos before black as well as an opaque one."""
-    gaussians = Gaussians.from_points(torch.tensor([[0.0, 0.0, 4.0]]), torch.zeros(1, 3), 0, opacity=0.5, scale=1.0)
-    gaussians.log_scales.data.fill_(3.0)
-    field = RadianceField(gaussians, response_by_name("srgb"), base_time=EXPOSURE_TIME)
-    camera = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+def wall_scene(field: RadianceField, camera: Camera, *, transparent: bool) -> Scene:
+    """Two photos of a field before black."""
     codes = codes_of(field.render_ldr(camera).numpy(), 8)
     views = tuple(View(name, codes, camera, EXPOSURE_TIME, "train") for name in "ab")
     points = field.gaussians.means.detach().double().numpy()
-    scene = Scene("wall", "transforms", views, points, np.ones((1, 3), np.float32), black_background=transparent)
-    times = {"densification.refine_start_iter": 1000, "densification.refine_stop_iter": 1001, "schedule.ema_window": 0}
+    return Scene("wall", "transforms", views, points, np.ones((1, 3), np.float32), black_background=transparent)
+
+
+def wall_field(log_scale: float) -> RadianceField:
+    """A Gaussian that lets through half of its light."""
+    gaussians = Gaussians.from_points(torch.tensor([[0.0, 0.0, 4.0]]), torch.zeros(1, 3), 0, opacity=0.5, scale=1.0)
+    gaussians.log_scales.data.fill_(log_scale)
+    return RadianceField(gaussians, response_by_name("srgb"), base_time=EXPOSURE_TIME)
+
+
+NO_REFINEMENT = {"densification.refine_start_iter": 0, "densification.refine_stop_iter": 0, "schedule.ema_window": 0}
+
+
+@pytest.mark.parametrize(("weight", "transparent"), [(7.0, False), (0.0, False), (7.0, True)])
+def test_surfaces_become_opaque(weight, transparent):
+    """A wall that lets through half of its light fits photos before black as well as an opaque one."""
+    field, camera = wall_field(3.0), Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+    scene = wall_scene(field, camera, transparent=transparent)
+    photo = scene.views[0].image
     rates = {"optimizer.opacity_logits": 0.3, "optimizer.harmonics_dc": 0.05, "loss.opacity_weight": 0.0}
-    trainer = Trainer(scene, quick(length=600, **times, **rates, **{"loss.transmittance_weight": weight}), field)
+    config = quick(length=600, **NO_REFINEMENT, **rates, **{"loss.transmittance_weight": weight})
+    trainer = Trainer(scene, config, field)
     for _ in range(600):
         trainer.step()
     alpha = field.render(camera).alpha
     assert alpha.min() > 0.9 if weight and not transparent else alpha.max() < 0.65
-    assert np.abs(field.render_ldr(camera).numpy() - codes / 255).max() < 0.03
+    assert np.abs(field.render_ldr(camera).numpy() - photo).max() < 0.03
+
+
+def test_steps_that_make_surfaces_opaque_leave_shapes(device):
+    """They would grow Gaussians at the borders of photos into what no photo shows."""
+    field, camera = wall_field(-1.0), Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+    scene = wall_scene(field, camera, transparent=False)
+    trainer = Trainer(scene, quick(length=100, **NO_REFINEMENT, **{"loss.transmittance_weight": 1.0}), field.to(device))
+    moved = []
+    for _ in range(100):
+        before = {name: tensor.detach().clone() for name, tensor in field.gaussians.tensors().items()}
+        trainer.step()
+        after = field.gaussians.tensors()
+        moved.append({name for name, tensor in before.items() if not torch.equal(tensor, after[name])})
+    shapes = {"means", "log_scales"}
+    assert all(shapes <= names for names in moved[:49] + moved[54:])
+    assert all(not shapes & names and "opacity_logits" in names for names in moved[49:54])
+
+
+@pytest.mark.parametrize(
+    ("stop", "weight", "expected"),
+    [(600, 0.3, range(600, 650)), (100, 0.3, range(500, 550)), (970, 0.3, range(970, 1000)), (600, 0.0, range(0))],
+)
+def test_surfaces_become_opaque_after_the_last_refinement(stop, weight, expected):
+    config = quick(length=1000, **{"loss.transmittance_weight": weight})
+    steps = opaque_steps(config, Schedule(0, stop, 100))
+    assert list(steps) == list(expected)

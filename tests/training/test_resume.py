@@ -265,22 +265,25 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(scene, tmp_path):
             use(run.path)
 
 
-def test_a_run_without_an_angle_goes_on_along_the_cameras_axes(scene, tmp_path):
-    """Runs of version 0.3 do not state model.order_angle."""
+@pytest.mark.parametrize(
+    ("table", "field", "now"), [("model", "order_angle", 25.0), ("loss", "transmittance_weight", 0.1)]
+)
+def test_a_run_of_an_earlier_version_goes_on_without_new_fields(scene, tmp_path, table, field, now):
+    """Runs of version 0.3 do not state them, and were trained as by 0."""
     blind, places = without_truth(scene), []
-    for name, angle in (("stated", 0.0), ("older", 0.0), ("turned", 25.0)):
-        config = quick(**{"schedule.iterations": 5, "model.order_angle": angle})
+    for name, value in (("stated", 0.0), ("older", 0.0), ("new", now)):
+        config = quick(**{"schedule.iterations": 5, f"{table}.{field}": value})
         create_trainer(blind, tmp_path / name, config, device="cpu").output.folder.unlock()
         if name == "older":
             folder = RunFolder(tmp_path / name)
             values = json.loads(folder.config_file.read_text())
-            del values["model"]["order_angle"]
+            del values[table][field]
             folder.config_file.write_text(json.dumps(values))
             (file,) = folder.path.glob("checkpoints/*/*.json")
             file.write_text(json.dumps(json.loads(file.read_text()) | {"run": folder.hashes()}))
         run = train(blind, tmp_path / name, device="cpu", resume=True)
         places.append(run.field.gaussians.means)
-        assert run.config.model.order_angle == angle
+        assert run.config.model_dump()[table][field] == value
     assert torch.equal(places[0], places[1]) and not torch.equal(places[0], places[2])
 
 
