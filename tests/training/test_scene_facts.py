@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sehdr_warp.scene import codes_of
+from sehdr_warp.scene import View, codes_of
 from sehdr_warp.training.scene_facts import measure_scene
+
+
+def with_codes(view: View, codes: np.ndarray) -> View:
+    """The view with other codes, perhaps of another size."""
+    height, width, _ = codes.shape
+    return replace(view, codes=codes, camera=view.camera.resized(width, height), hdr=None)
 
 
 def test_facts_are_those_of_the_scene(scene, facts):
@@ -63,7 +69,7 @@ def test_a_white_below_255_is_found_in_jpegs_that_ring(scene, white, quality, pl
             Image.fromarray(codes).save(file, "JPEG", quality=quality)
             codes = np.asarray(Image.open(file))
             assert white == 255 or codes.max() > white + 2
-        views.append(replace(view, codes=codes, camera=view.camera.resized(128, 96)))
+        views.append(with_codes(view, codes))
     assert measure_scene(replace(scene, views=tuple(views))).plateau == plateau
 
 
@@ -73,5 +79,5 @@ def test_a_bright_surface_is_no_white_below_255(scene, lamp):
     if lamp:
         codes[10:50, 10:60], codes[60:70, 60:70] = 225, 255
     codes = np.rint(codes).astype(np.uint8)
-    views = [replace(view, codes=codes, camera=view.camera.resized(128, 96)) for view in scene.views]
+    views = [with_codes(view, codes) for view in scene.views]
     assert measure_scene(replace(scene, views=tuple(views))).plateau == 0
