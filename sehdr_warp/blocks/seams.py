@@ -40,9 +40,8 @@ def measure_seams(run: Run, views: tuple[View, ...], division: Division, depths:
         photo = torch.tensor(view.image, device=run.device)
         prediction = run.render_ldr(view.camera, view.exposure_time)
         depth = (depths or run).render(view.camera).depth.cpu().numpy()
-        at_border = (division.border_distance(surface_points(view.camera, depth).reshape(-1, 3)) < near).reshape(
-            depth.shape
-        ) & (depth > 0)
+        points = surface_points(view.camera, depth).reshape(-1, 3)
+        at_border = (division.border_distance(points).reshape(depth.shape) < near) & (depth > 0)
         mask = np.ones(depth.shape) if view.mask is None else view.mask
         total = np.zeros(2)
         for row, part in enumerate((at_border, ~at_border)):
