@@ -5,6 +5,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from functools import wraps
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any, get_origin
@@ -13,7 +14,7 @@ import tyro
 
 from sehdr_warp.arguments import MARKERS
 from sehdr_warp.cli import run_program
-from sehdr_warp.files import write_json
+from sehdr_warp.files import check_absent, write_json
 
 from .results import finish
 
@@ -21,16 +22,24 @@ from .results import finish
 def run(main: Callable[..., Any]) -> None:
     """Call main() with the words of the command line and exit; a user's error is one line.
 
-    The arguments before `/` stand without a flag, the others are flags.
+    The arguments before `/` stand without a flag, the others are flags. If `json` may not be written, nothing is
+    measured.
     """
     for name, parameter in inspect.signature(main).parameters.items():
         starred = parameter.kind is parameter.POSITIONAL_ONLY and get_origin(parameter.annotation) is tuple
         absent = parameter.default in (None, ()) or parameter.default is False
         if starred or absent:  # Else the help would say `(default: None)`.
             main.__annotations__[name] = Annotated[parameter.annotation, tyro.conf.arg(help_behavior_hint="")]
+
+    @wraps(main)
+    def checked(*values: Any, **options: Any) -> None:
+        if (result := options.get("json")) is not None:
+            check_absent(result, overwrite=True)
+        main(*values, **options)
+
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     program = f"python -m {sys.modules['__main__'].__spec__.name}"  # pyright: ignore[reportOptionalMemberAccess]
-    run_program(lambda words: tyro.cli(main, prog=program, args=words, config=MARKERS), sys.argv[1:], program)
+    run_program(lambda words: tyro.cli(checked, prog=program, args=words, config=MARKERS), sys.argv[1:], program)
 
 
 def add_rows(result: dict, json: Path, measure: Callable[[Any], dict], jobs: Iterable[Any], at_once: int) -> None:

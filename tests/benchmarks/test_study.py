@@ -47,6 +47,19 @@ def test_an_error_of_a_study_is_one_line(monkeypatch, capsys):
     assert re.fullmatch(r"python -m \S+: x: is not there; name another\n", capsys.readouterr().err)
 
 
+def test_nothing_is_measured_for_a_file_that_may_not_be_replaced(monkeypatch, capsys, tmp_path):
+    measured = []
+
+    def main(json: Path) -> None:
+        measured.append(json)
+
+    own = tmp_path / "own.json"
+    own.write_text("{}")
+    assert ended(monkeypatch, main, "--json", str(own)) == 1 and not measured
+    assert "never replaced" in capsys.readouterr().err
+    assert ended(monkeypatch, main, "--json", str(tmp_path / "new.json")) == 0 and len(measured) == 1
+
+
 def test_a_default_of_0_is_stated_and_none_is_not(monkeypatch, capsys):
     def main(seed: int = 0, limit: int | None = None) -> None:
         """Train.
