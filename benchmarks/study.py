@@ -32,14 +32,14 @@ def run(main: Callable[..., Any]) -> None:
             main.__annotations__[name] = Annotated[parameter.annotation, tyro.conf.arg(help_behavior_hint="")]
 
     @wraps(main)
-    def checked(*values: Any, **options: Any) -> None:
+    def check_and_call(*values: Any, **options: Any) -> None:
         if (result := options.get("json")) is not None:
             check_absent(result, overwrite=True)
         main(*values, **options)
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     program = f"python -m {sys.modules['__main__'].__spec__.name}"  # pyright: ignore[reportOptionalMemberAccess]
-    run_program(lambda words: tyro.cli(checked, prog=program, args=words, config=MARKERS), sys.argv[1:], program)
+    run_program(lambda words: tyro.cli(check_and_call, prog=program, args=words, config=MARKERS), sys.argv[1:], program)
 
 
 def add_rows(result: dict, json: Path, measure: Callable[[Any], dict], jobs: Iterable[Any], at_once: int) -> None:

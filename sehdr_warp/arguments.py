@@ -86,8 +86,8 @@ def _check_flags(options: type, words: list[str], program: str) -> None:
             raise UsageError(f"{program} {words[0]}: no such command{hint}")
         _check_flags(commands[words[0]], words[1:], f"{program} {words[0]}")
         return
-    names, bare = {"--help", *flags(options)}, {"--" + name: shown for name, shown in positional(options).items()}
-    bare |= {f"--{shown.lower()}": shown for shown in bare.values()}
+    names, bare = {"--help", *flags(options)}, {"--" + name: metavar for name, metavar in positional(options).items()}
+    bare |= {f"--{metavar.lower()}": metavar for metavar in bare.values()}
     removed = getattr(options, "removed_flags", {})
     for word in words:
         flag = word.partition("=")[0].replace("_", "-")
@@ -139,13 +139,13 @@ def flags(options: typing.Any) -> Iterator[str]:
 
 def positional(options: typing.Any) -> dict[str, str]:
     """Return the names of the options that stand on a command line without a flag, each with its name in the help."""
-    shown = {}
+    names = {}
     for name, hint in _hints(options).items():
         marks = getattr(hint, "__metadata__", ())
         if tyro.conf.Positional in marks:
             metavars = (getattr(mark, "metavar", None) for mark in marks)
-            shown[name] = next(filter(None, metavars), name.upper()).removesuffix(" ...")
-    return shown
+            names[name] = next(filter(None, metavars), name.upper()).removesuffix(" ...")
+    return names
 
 
 def _mend_help(options: type) -> None:

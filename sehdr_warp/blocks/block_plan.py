@@ -235,12 +235,12 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
         compensation = result.compensation
         log.info("plan: %s: %s (%s)", result.decision.name, result.decision.choice, result.decision.reason)
     compensated = scene if compensation is None else compensation.normalize_photos(scene, response)
-    full = [_camera_of_training(view, data.get("max_size")) for view in scene.train_views]
-    shared = SharedDecisions(base_time_of(compensated), compensation, _antialiased(full, config))
+    training_cameras = [_camera_of_training(view, data.get("max_size")) for view in scene.train_views]
+    shared = SharedDecisions(base_time_of(compensated), compensation, _antialiased(training_cameras, config))
     cameras = [view.camera for view in scene.train_views]
     points = _places(compensated, response, device)
     if count is None:
-        count = blocks_for(len(full), sum(camera.pixel_count for camera in full), config)
+        count = blocks_for(len(training_cameras), sum(each.pixel_count for each in training_cameras), config)
         division = largest_count(scene.name, cameras, points, count) if count > 1 else None
         if division is None:
             reason = "its photos do not show different places" if count > 1 else "its photos are few enough"
@@ -262,7 +262,7 @@ def make_block_plan(data: LoadArguments, config: Config, device: torch.device, c
         _blocks(scene, division, points),
     )
     sizes = ", ".join(str(len(own)) for own in division.photos)
-    log.info("plan: blocks: %d, with %s of %d training photos", len(plan.blocks), sizes, len(full))
+    log.info("plan: blocks: %d, with %s of %d training photos", len(plan.blocks), sizes, len(training_cameras))
     return plan
 
 

@@ -393,7 +393,7 @@ class RadianceField(nn.Module):
             antialiased=self.antialiased,
             **pixel_filter.wide_options(self, camera, log_scales, opacities, at_place)._asdict(),
         )
-        if (shown := camera.shown) is not None:
-            image, transmittance = image * shown[..., None], 1 - (1 - transmittance) * shown
+        if (lens_mask := camera.lens_mask) is not None:
+            image, transmittance = image * lens_mask[..., None], 1 - (1 - transmittance) * lens_mask
         none = features.new_zeros(len(features), 2)
         return Rendering(image, transmittance, none, none[:, 0], none, 0)

@@ -95,24 +95,26 @@ class CameraTensors:
     intrinsics: Tensor  # [4] fx, fy, cx, cy
     position: Tensor  # [3] in the coordinates that world_to_camera maps; for a training, normalized ones
     directions: Tensor | None = None  # [H, W, 3] unit vectors along which pixels look, world axes; None to linearize
-    shown: Tensor | None = None  # [H, W] 1 for pixels that the lens shows, 0 beyond its border; None if it shows all
+    lens_mask: Tensor | None = (
+        None  # [H, W] 1 for pixels that the lens shows, 0 beyond its border; None if it shows all
+    )
 
     @staticmethod
     def of(camera: Camera, device: torch.device | str, *, along_rays: bool = False) -> "CameraTensors":
         """Copy a camera to a device, a pinhole with the directions of its pixels if `along_rays`."""
         values = camera.world_to_camera, camera.intrinsics, camera.position
         pose, *others = (torch.tensor(value, dtype=torch.float32, device=device) for value in values)
-        directions = shown = None
+        directions = lens_mask = None
         if not camera.is_pinhole:
             along = pixel_directions(camera) @ camera.world_to_camera[:3, :3]
             inside = np.isfinite(along[..., 0])
             along = np.where(inside[..., None], along, camera.world_to_camera[2, :3])  # Any, for pixels without a ray
             directions = torch.tensor(along, dtype=torch.float32, device=device)
-            shown = None if inside.all() else torch.tensor(inside, dtype=torch.float32, device=device)
+            lens_mask = None if inside.all() else torch.tensor(inside, dtype=torch.float32, device=device)
         elif along_rays:
             directions = _rays(camera, pose)
         width, height = camera.width, camera.height
-        return CameraTensors(width, height, pose, *others, directions, shown)  # pyright: ignore[reportCallIssue]
+        return CameraTensors(width, height, pose, *others, directions, lens_mask)  # pyright: ignore[reportCallIssue]
 
 
 def _rays(camera: Camera, pose: Tensor) -> Tensor:

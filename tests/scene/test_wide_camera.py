@@ -54,9 +54,11 @@ def test_depths_of_wide_cameras_are_distances_and_those_of_pinholes_lie_along_th
     camera = replace(camera, world_to_camera=look_at((1, 2, 3), (0, 0, 1)))
     depth = np.full((camera.height, camera.width), 2.5)
     offsets = surface_points(camera, depth) - camera.position
-    shown = np.isfinite(pixel_directions(camera)).all(2)
-    np.testing.assert_allclose(np.linalg.norm(offsets, axis=2), np.where(shown, 2.5, 0))
-    np.testing.assert_allclose(offsets[shown], 2.5 * (pixel_directions(camera) @ camera.world_to_camera[:3, :3])[shown])
+    inside = np.isfinite(pixel_directions(camera)).all(2)
+    np.testing.assert_allclose(np.linalg.norm(offsets, axis=2), np.where(inside, 2.5, 0))
+    np.testing.assert_allclose(
+        offsets[inside], 2.5 * (pixel_directions(camera) @ camera.world_to_camera[:3, :3])[inside]
+    )
     pinhole = replace(camera, projection="pinhole", distortion=())
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     expected = pinhole.unproject(x.ravel(), y.ravel(), depth.ravel()).reshape(offsets.shape)

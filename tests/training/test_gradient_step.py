@@ -147,15 +147,15 @@ def test_steps_that_make_surfaces_opaque_leave_shapes(device):
     field, camera = wall_field(-1.0), Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     scene = wall_scene(field, camera, transparent=False)
     trainer = Trainer(scene, quick(length=100, **NO_REFINEMENT, **{"loss.transmittance_weight": 1.0}), field.to(device))
-    moved = []
+    changes = []
     for _ in range(100):
         before = {name: tensor.detach().clone() for name, tensor in field.gaussians.tensors().items()}
         trainer.step()
         after = field.gaussians.tensors()
-        moved.append({name for name, tensor in before.items() if not torch.equal(tensor, after[name])})
+        changes.append({name for name, tensor in before.items() if not torch.equal(tensor, after[name])})
     shapes = {"means", "log_scales"}
-    assert all(shapes <= names for names in moved[:49] + moved[54:])
-    assert all(not shapes & names and "opacity_logits" in names for names in moved[49:54])
+    assert all(shapes <= names for names in changes[:49] + changes[54:])
+    assert all(not shapes & names and "opacity_logits" in names for names in changes[49:54])
 
 
 @pytest.mark.parametrize(

@@ -165,5 +165,5 @@ def visible_surface(run: "RenderableScene", camera: Camera, least_alpha: float =
     """Return points [N, 3] of the surface that a camera shows, and their radiance [N, 3]."""
     rendered = run.render(camera, supersample=False)
     depth, alpha = rendered.depth.cpu().numpy(), rendered.alpha.cpu().numpy()
-    shown = (depth > 0) & (alpha > least_alpha)
-    return surface_points(camera, depth)[shown], rendered.hdr.cpu().numpy()[shown]
+    visible = (depth > 0) & (alpha > least_alpha)
+    return surface_points(camera, depth)[visible], rendered.hdr.cpu().numpy()[visible]
