@@ -28,7 +28,7 @@ _OTHER_NAMES = {
     **dict.fromkeys(("--data-factor", "--downscale-factor", "--resolution"), "--max-size"),
     "--test-every": "--holdout",
 }
-"""Flags of gsplat, nerfstudio and 3DGS, which no similar spelling leads to, and what stands in their place here."""
+"""Flags of gsplat, nerfstudio and 3DGS, each with the flag of the same purpose here, which is spelled otherwise."""
 MARKERS = (
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.OmitArgPrefixes,
@@ -100,7 +100,8 @@ def _check_flags(options: type, words: list[str], program: str) -> None:
         # A mistyped part of a dotted flag (--los.clipping) is similar to the flag; a missing part (--clipping) is not.
         by_field = {name.rpartition(".")[2].removeprefix("--"): name for name in names if "." in name}
         if (own := _OTHER_NAMES.get(flag)) in names:
-            raise UsageError(f"{program} has no {flag}, did you mean {own}?")
+            unit = ", the longest side in pixels" if own == "--max-size" else ""
+            raise UsageError(f"{program} has no {flag}, did you mean {own}{unit}?")
         hint = did_you_mean(flag, names) or (f", did you mean {by_field[flag[2:]]}?" if flag[2:] in by_field else "")
         raise UsageError(f"{program} has no {flag:.80}{hint or f'; see {program} --help'}")
 

@@ -238,7 +238,7 @@ def _inside(pair: tuple[Tensor, Tensor], mask: Tensor | None) -> tuple[Tensor, T
     """Return prediction and truth with the prediction set to the truth where the mask is 0.
 
     Windows across the border of the mask then contain no error from outside. What has a part of the weight, such as a
-    pixel near the pole of a panorama, is weighed by the metrics alone.
+    pixel near the pole of a panorama, is weighed by PSNR and SSIM; LPIPS counts it fully.
     """
     prediction, truth = pair
     return (prediction if mask is None else torch.where(mask[..., None] > 0, prediction, truth)), truth

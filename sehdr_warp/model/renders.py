@@ -95,9 +95,7 @@ class CameraTensors:
     intrinsics: Tensor  # [4] fx, fy, cx, cy
     position: Tensor  # [3] in the coordinates that world_to_camera maps; for a training, normalized ones
     directions: Tensor | None = None  # [H, W, 3] unit vectors along which pixels look, world axes; None to linearize
-    lens_mask: Tensor | None = (
-        None  # [H, W] 1 for pixels that the lens shows, 0 beyond its border; None if it shows all
-    )
+    lens_mask: Tensor | None = None  # [H, W] 1 within the picture of the lens, 0 beyond; None if all is within
 
     @staticmethod
     def of(camera: Camera, device: torch.device | str, *, along_rays: bool = False) -> "CameraTensors":
@@ -108,7 +106,8 @@ class CameraTensors:
         if not camera.is_pinhole:
             along = pixel_directions(camera) @ camera.world_to_camera[:3, :3]
             inside = np.isfinite(along[..., 0])
-            along = np.where(inside[..., None], along, camera.world_to_camera[2, :3])  # Any, for pixels without a ray
+            # Pixels without a ray look along the axis; lens_mask makes them black.
+            along = np.where(inside[..., None], along, camera.world_to_camera[2, :3])
             directions = torch.tensor(along, dtype=torch.float32, device=device)
             lens_mask = None if inside.all() else torch.tensor(inside, dtype=torch.float32, device=device)
         elif along_rays:

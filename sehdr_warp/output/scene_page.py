@@ -53,7 +53,7 @@ def write_scene_page(
     require_loaded("load_run", run)
     path = path_of(path, "path")
     if path.suffix.lower() != ".html":  # By which browsers know a page
-        raise InputError(path, f"{path.suffix or 'no suffix'} is not the suffix of a page", "use .html")
+        raise InputError(path, f"has {path.suffix or 'no suffix'}, a page has .html", "use .html")
     if not isinstance(edits, SplatEdits | None):
         raise TypeError(f"edits is a {type(edits).__name__}, expected SplatEdits, such as SplatEdits(min_views=2)")
     check_absent(path, overwrite)

@@ -135,9 +135,9 @@ class LossConfig(_Table):
     last relocation on and, where a photo shows less than a tenth of the scene, for new Gaussians until a photo shows
     them; more leaves surfaces transparent"""
     transmittance_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 1.0
-    """weight of the mean transmittance of the pixels in a twentieth of the steps, after the last relocation; these make
-    surfaces opaque and leave the shapes of the Gaussians; it is less in trainings below 4,000 steps, and 0 for rendered
-    sets whose transparent parts count as black"""
+    """weight of the mean transmittance of the pixels in a twentieth of the steps, after the last relocation and in the
+    second half; these make surfaces opaque, and give positions, sizes and rotations no gradient; it is less in
+    trainings below 4,000 steps, and 0 for rendered sets whose transparent parts count as black"""
     size_weight: Annotated[float, Field(ge=0.0, le=10.0)] = 0.01
     """weight of the mean size of the Gaussians in units of the cameras' radius (3DGS-MCMC), which shrinks those that no
     photo supports, and which can veil new views; it is 0 from the last relocation on, and where a photo

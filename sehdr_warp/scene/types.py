@@ -41,9 +41,9 @@ class View:
         uncertain: whether structure from motion placed the camera by few points.
 
     Raises:
-        TypeError: for a field of another type.
-        ValueError: for an array of another type or size than stated here, and for a value out of range. Pixels are not
-            read; codes_of returns codes for encoded values.
+        TypeError: for a name, camera, exposure time or source of another type.
+        ValueError: for an array of another type or size than stated here, and for another split, exposure time or
+            orientation. Pixels are not read; codes_of returns codes for encoded values.
     """
 
     name: str

@@ -37,7 +37,10 @@ class FlatGradients:
 
     @torch.no_grad()
     def collect(self, loss: Tensor, overflow: Tensor | None, harmonics: HarmonicsGradients | None = None) -> None:
-        """Move the parameters' gradients to the buffer, with the numbers of the step."""
+        """Move the parameters' gradients to the buffer, with the numbers of the step.
+
+        All ranks must have gradients of the same parameters, which may differ from step to step.
+        """
         gradients = {k: value.grad for k, value in enumerate(self.parameters) if value.grad is not None}
         self._with_gradient = [*gradients]
         torch._foreach_copy_([self._views[k] for k in gradients], [*gradients.values()])

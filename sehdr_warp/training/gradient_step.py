@@ -45,7 +45,7 @@ OPAQUE_STEPS = 0.05
 
 WHOLE_WEIGHT_FROM = 4000
 """Steps of the shortest training that has the whole weight of the transmittance. Shorter ones have less in proportion:
-with the whole weight, those of 600 to 1,000 steps lose 0.2 to 0.6 dB, because colors cannot follow the opacities."""
+with the whole weight, those of 600 to 1,000 steps lose 0.2 to 0.7 dB, because colors cannot follow the opacities."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class StepOptions:
 
     degree: int  # SH degree
     refines: bool  # Whether the strategy still changes the number of Gaussians
-    makes_opaque: bool  # Whether the step makes surfaces opaque, and leaves the shapes of the Gaussians as they are
+    makes_opaque: bool  # Whether the step makes surfaces opaque; positions, sizes and rotations then get no gradient
     needs_means2d_grad: bool  # Whether the strategy accumulates the gradients of the projected means
 
 
@@ -145,14 +145,23 @@ class OrderAxis:
                 component.fill_(generator.uniform(-slope, slope))  # Unlike a copy, it does not wait for a GPU.
 
 
-def opaque_steps(config: Config, schedule: Schedule) -> range:
-    """Return the iterations of the steps that make surfaces opaque; none if transmittance has no weight.
+def opaque_steps(config: Config, schedule: Schedule, *, black_background: bool = False) -> range:
+    """Return the iterations of the steps that make surfaces opaque.
 
-    They follow the last refinement, and lie in the second half of a training: earlier, surfaces are misplaced.
+    They follow the last refinement, and lie in the second half of a training: earlier, surfaces are misplaced. There
+    are none if transmittance has no weight, if transparent parts of photos count as black, or if refinement lasts to
+    the end.
     """
     total = config.schedule.iterations
-    start = max(schedule.stop, total // 2) if config.loss.transmittance_weight else total
+    if not config.loss.transmittance_weight or black_background:
+        return range(0)
+    start = max(schedule.stop, total // 2)
     return range(start, min(start + math.ceil(OPAQUE_STEPS * total), total))
+
+
+def transmittance_weight(config: Config, batch: int) -> float:
+    """Return the weight of the transmittance in these steps, each of `batch` photos; see WHOLE_WEIGHT_FROM."""
+    return config.loss.transmittance_weight * min(1.0, config.schedule.iterations / (WHOLE_WEIGHT_FROM * batch))
 
 
 class GradientStep:
@@ -194,9 +203,8 @@ class GradientStep:
         self._spares_unseen = large_scene
         self._dropout = Dropout(config.model.dropout, config.seed, config.schedule.iterations, device)
         self._order = OrderAxis(config.model.order_angle, config.seed, device)
-        self._transmittance_weight = config.loss.transmittance_weight
-        self._transmittance_weight *= min(1.0, config.schedule.iterations / WHOLE_WEIGHT_FROM)
-        self._opaque_steps = range(0) if scene.black_background else opaque_steps(config, strategy.schedule)
+        self._transmittance_weight = transmittance_weight(config, 1 if ranks is None else ranks.count)
+        self._opaque_steps = opaque_steps(config, strategy.schedule, black_background=scene.black_background)
         self._flat_gradients: FlatGradients | None = None  # Buffer that ranks exchange
 
     def options_at(self, iteration: int, degree: int) -> StepOptions:

@@ -51,7 +51,7 @@ def train(
     tensorboard: bool = False,
     data: LoadArguments | None = None,
 ) -> Run:
-    """Train a scene to the end; see create_trainer() for the arguments.
+    """Train a scene to the end.
 
     Args:
         scene: A scene from load_scene().
@@ -71,8 +71,9 @@ def train(
         SehdrError: If the training diverges, or the disk or the memory is full.
         KeyboardInterrupt: After a checkpoint was written.
     """
-    places = {"resume": resume, "overwrite": overwrite, "tensorboard": tensorboard, "data": data}
-    return create_trainer(scene, out, config, device=device, **places).train()
+    return create_trainer(
+        scene, out, config, device=device, resume=resume, overwrite=overwrite, tensorboard=tensorboard, data=data
+    ).train()
 
 
 def create_trainer(

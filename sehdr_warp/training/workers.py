@@ -96,8 +96,11 @@ def _in_world_of_rank_0(scene: Scene, message: TrainingMessage) -> Scene:
 
 
 def _training_part(scene: Scene) -> Scene:
-    """Return what other ranks need of a scene: its training views and points."""
-    return Scene(scene.name, scene.format, scene.train_views, scene.points, scene.point_colors)
+    """Return what other ranks need of a scene: its training views, points and background."""
+    background = scene.black_background
+    return Scene(
+        scene.name, scene.format, scene.train_views, scene.points, scene.point_colors, black_background=background
+    )
 
 
 def _bytes_of(scene: Scene) -> int:

@@ -74,7 +74,7 @@ def test_refusals(run, tmp_path):
     with pytest.raises(InputError, match="exists already"):
         write_scene_page(run, tmp_path / "mine.html")
     for name, suffix in (("page", "no suffix"), ("page.ply", ".ply"), ("page.html.gz", ".gz")):
-        with pytest.raises(InputError, match=rf"{name}: {suffix} is not the suffix of a page; use .html"):
+        with pytest.raises(InputError, match=rf"{name}: has {suffix}, a page has .html; use .html"):
             write_scene_page(run, tmp_path / name)
     with pytest.raises(UsageError, match="without effect on a page"):
         run_export(Export(run=run.path, out=tmp_path / "new.html", cameras=True))

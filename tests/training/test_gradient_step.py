@@ -9,7 +9,7 @@ from sehdr_warp.model.gaussians import Gaussians, moments_of
 from sehdr_warp.model.radiance_field import RadianceField
 from sehdr_warp.response import response_by_name
 from sehdr_warp.scene import Camera, Scene, View, codes_of
-from sehdr_warp.training.gradient_step import Dropout, OrderAxis, opaque_steps
+from sehdr_warp.training.gradient_step import Dropout, OrderAxis, opaque_steps, transmittance_weight
 from sehdr_warp.training.strategies.base import Schedule
 from sehdr_warp.training.trainer import Trainer
 
@@ -142,7 +142,7 @@ def test_surfaces_become_opaque(weight, transparent):
     assert np.abs(field.render_ldr(camera).numpy() - photo).max() < 0.03
 
 
-def test_steps_that_make_surfaces_opaque_leave_shapes(device):
+def test_steps_that_make_surfaces_opaque_leave_positions_and_sizes(device):
     """They would grow Gaussians at the borders of photos into what no photo shows."""
     field, camera = wall_field(-1.0), Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     scene = wall_scene(field, camera, transparent=False)
@@ -153,16 +153,27 @@ def test_steps_that_make_surfaces_opaque_leave_shapes(device):
         trainer.step()
         after = field.gaussians.tensors()
         changes.append({name for name, tensor in before.items() if not torch.equal(tensor, after[name])})
-    shapes = {"means", "log_scales"}
+    shapes = {"means", "log_scales"}  # Rotations of a round Gaussian get no gradient at any time.
     assert all(shapes <= names for names in changes[:49] + changes[54:])
     assert all(not shapes & names and "opacity_logits" in names for names in changes[49:54])
 
 
 @pytest.mark.parametrize(
-    ("stop", "weight", "expected"),
-    [(600, 0.3, range(600, 650)), (100, 0.3, range(500, 550)), (970, 0.3, range(970, 1000)), (600, 0.0, range(0))],
+    ("stop", "weight", "black", "expected"),
+    [
+        (600, 0.3, False, range(600, 650)),
+        (100, 0.3, False, range(500, 550)),
+        (970, 0.3, False, range(970, 1000)),
+        (1000, 0.3, False, range(0)),
+        (600, 0.0, False, range(0)),
+        (600, 0.3, True, range(0)),
+    ],
 )
-def test_surfaces_become_opaque_after_the_last_refinement(stop, weight, expected):
+def test_surfaces_become_opaque_after_the_last_refinement(stop, weight, black, expected):
     config = quick(length=1000, **{"loss.transmittance_weight": weight})
-    steps = opaque_steps(config, Schedule(0, stop, 100))
-    assert list(steps) == list(expected)
+    assert opaque_steps(config, Schedule(0, stop, 100), black_background=black) == expected
+
+
+def test_trainings_of_few_steps_have_less_of_the_weight():
+    weights = [transmittance_weight(quick(length=length), batch) for length, batch in ((8000, 1), (1000, 1), (8000, 8))]
+    assert weights == [1.0, 0.25, 0.25]

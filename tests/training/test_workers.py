@@ -66,6 +66,12 @@ def photos_of_second_node(scene, request):
     return ranks.photos
 
 
+@pytest.mark.parametrize("black", [False, True])
+def test_nodes_know_whether_transparent_parts_count_as_black(black):
+    scene = replace(toy_scene(6), black_background=black)
+    assert photos_of_second_node(scene, Photos(scene, {})).black_background == black
+
+
 def test_nodes_must_have_the_same_photos():
     scene = toy_scene(6)
     photos = photos_of_second_node(scene, Photos(scene, {}))
