@@ -13,7 +13,7 @@ from typing import Any
 
 MAX_MESSAGE_PART = 400  # Characters of a path and of a problem that a message shows; both may come from a damaged file
 
-MOST_LISTED = 2000  # Names beside a missing path among which the one that was meant is looked for
+MOST_LISTED = 2000  # Entries of a folder among which the one that was meant is looked for
 
 NOT_FINITE_REMEDY = "it is not written; train again from an earlier checkpoint or with another seed"
 

@@ -43,7 +43,8 @@ class RenderedView:
     Attributes:
         hdr: [H, W, 3] float32 scene-linear radiance, >= 0, not multiplied by an exposure time.
         alpha: [H, W] coverage in [0, 1].
-        depth: [H, W] mean distance along the camera's axis if alpha is above 0.001, else 0; scene units.
+        depth: [H, W] mean distance if alpha is above 0.001, else 0; scene units; along the axis of a pinhole camera,
+            from the place of a panorama or fisheye camera.
         confidence: [H, W] in [0, 1] as in DirectionalRender; None if it was not measured or not asked for.
         clipped: [H, W] in [0, 1], as from render_clipped; None if it was not measured or not asked for.
     """

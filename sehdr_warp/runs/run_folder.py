@@ -116,7 +116,7 @@ class RunFolder:
                 raise InputError(self.path, problem, remedy)
 
     def _run_within(self) -> Path | None:
-        """Return the newest run among the folders in this one, of several trainings for example; None without one."""
+        """Return the run in this folder whose training began last, of MOST_LISTED entries; None without one."""
         with suppress(OSError):
             configs = (entry / self.config_file.name for entry in islice(self.path.iterdir(), MOST_LISTED))
             runs = [

@@ -20,7 +20,7 @@ SPLITS = "train", "test"
 
 @dataclass(frozen=True, repr=False)
 class View:
-    """One photo with its undistorted pinhole camera.
+    """One photo with its camera, which is undistorted if it is a pinhole.
 
     Attributes:
         name: the image's stem in the data (`r_0`); unique within a scene.

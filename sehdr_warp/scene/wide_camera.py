@@ -29,7 +29,7 @@ def pixel_directions(camera: Camera) -> np.ndarray:
 
 
 def pixel_rays(camera: Camera) -> np.ndarray:
-    """Return [H, W, 3] float64 rays in camera axes, by which a render's depths become places.
+    """Return [H, W, 3] float64 rays in camera axes that, times a render's depths, lead from camera to surface.
 
     Those of a pinhole are 1 long along its axis, as depths are measured along it. Those of a wide camera are unit
     vectors, as its depths are distances; 0 where its lens shows nothing.

@@ -29,7 +29,7 @@ uniform vec4 lens, photoLens;                // fx, fy, cx, cy over width and he
 uniform vec4 bend;                           // k1 to k4 of a fisheye photo
 uniform float reach;                         // its widest angle from the axis
 
-// tone and overlay: of the lists above. left of the split: 0 scene, 1 other, 2 photo. shape of the photo: 0 pinhole
+// tone and overlay: of the lists above. left of the split: 0 scene, 1 other, 2 photo. shape of the photo: 0 pinhole, 1 panorama, 2 fisheye
 const vec3 LUMINANCE = vec3(0.2126, 0.7152, 0.0722);
 
 vec3 srgb(vec3 x) {
