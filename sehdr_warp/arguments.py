@@ -87,7 +87,7 @@ def _check_flags(options: type, words: list[str], program: str) -> None:
         _check_flags(commands[words[0]], words[1:], f"{program} {words[0]}")
         return
     names, bare = {"--help", *flags(options)}, {"--" + name: metavar for name, metavar in positional(options).items()}
-    bare |= {f"--{metavar.lower()}": metavar for metavar in bare.values()}
+    bare |= {f"--{word.lower()}": metavar for metavar in bare.values() for word in metavar.split("|")}
     removed = getattr(options, "removed_flags", {})
     for word in words:
         flag = word.partition("=")[0].replace("_", "-")

@@ -56,7 +56,8 @@ def train(
     Args:
         scene: A scene from load_scene().
         out: Run folder.
-        config: A preset, or fields that differ from the default one, such as {"schedule.iterations": 500}.
+        config: A Config, name or file of a preset, or fields that differ from the default one, such as
+            {"schedule.iterations": 500}.
         device: "cpu", "cuda:0", ...; by default the first GPU, or the CPU if there is none.
         resume: Continue the run in `out`.
         overwrite: Replace the run in `out`.

@@ -163,7 +163,7 @@ def test_what_cannot_be_evaluated_is_said():
 
 
 def test_pixels_of_part_of_the_weight_count_by_it():
-    """As those of a panorama do by their solid angles."""
+    """Pixels of a panorama count by their solid angles."""
     weights = np.full((24, 30), 1.0, np.float32)
     weights[:12] = 0.25
     photo = np.full((24, 30, 3), 0.5, np.float32)

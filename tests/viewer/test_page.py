@@ -166,14 +166,14 @@ def test_wide_photos_are_compared_with_where_they_show_it(chromium, serve, lens)
         rest(page)
         left = slice(0, scene.shape[1] // 2 - 4)
         beside = pixels(page, "#picture")[:, left]
-        shown = np.abs(beside - 26 / 255).max(axis=2) > 1 / 255
-        assert shown.mean() > (0.5 if projection == "OPENCV_FISHEYE" else 0.999)
-        assert np.abs(beside - scene[:, left])[shown].mean() < 0.02
+        visible = np.abs(beside - 26 / 255).max(axis=2) > 1 / 255
+        assert visible.mean() > (0.5 if projection == "OPENCV_FISHEYE" else 0.999)
+        assert np.abs(beside - scene[:, left])[visible].mean() < 0.02
         page.select_option("#left", "0")
         page.select_option("#overlay", "error")
         rest(page)
         no_error = np.abs(pixels(page, "#picture")[:, left] - [0.10, 0.09, 0.22]).max(axis=2) < 0.1
-        assert no_error[shown].mean() > 0.9
+        assert no_error[visible].mean() > 0.9
 
 
 def test_the_tables_are_the_shader(chromium, serve):

@@ -12,7 +12,7 @@ from ...errors import SehdrError, require_extra
 from ...progress import track_progress
 from ...runs.run import RenderableScene
 from ...scene import Camera
-from ...scene.wide_camera import face_cameras, face_size
+from ...scene.wide_camera import face_cameras, face_size, surface_points
 from ..world_transform import WorldTransform
 from .splat_edits import Box, Sphere
 
@@ -63,11 +63,10 @@ def _depth_view(run: RenderableScene, camera: Camera, transform: WorldTransform)
     return DepthView(transform.camera(camera), depth, torch.from_numpy(np.array(rendered.hdr.cpu().numpy())))
 
 
-def surface_points(view: DepthView) -> np.ndarray:
+def points_of_view(view: DepthView) -> np.ndarray:
     """Return the points [N, 3] of a view's depth."""
-    depth, camera = view.depth.numpy(), view.camera
-    row, column = np.nonzero(depth)
-    return camera.unproject(column + 0.5, row + 0.5, depth[row, column])
+    depth = view.depth.numpy()
+    return surface_points(view.camera, depth)[depth > 0]
 
 
 def mesh_bounds(views: Sequence[DepthView], region: Box | Sphere | None) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +80,7 @@ def mesh_bounds(views: Sequence[DepthView], region: Box | Sphere | None) -> tupl
         raise SehdrError("no view shows a surface to mesh; was the training long enough?")
     near = float(np.median(depths)) * _FAR
     points = np.concatenate(
-        [surface_points(replace(view, depth=torch.where(view.depth < near, view.depth, 0)))[::7] for view in views]
+        [points_of_view(replace(view, depth=torch.where(view.depth < near, view.depth, 0)))[::7] for view in views]
     )
     low, high = (np.percentile(points, q, axis=0) for q in _PERCENTILES)
     margin = 0.03 * (high - low).max()

@@ -30,7 +30,7 @@ from .depth_fusion import (
     marching_cubes_function,
     mesh_bounds,
     nearest_values,
-    surface_points,
+    points_of_view,
     voxel_centers,
     zero_surface,
 )
@@ -280,7 +280,7 @@ def _log_agreement(mesh: ProxyMesh, run: RenderableScene, transform: WorldTransf
     low, high = mesh.vertices.min(0) - mesh.voxel, mesh.vertices.max(0) + mesh.voxel
     differences, total = [np.zeros(0)], 0
     for view in (view for camera in cameras for view in depth_views(run, camera, transform, 120)):
-        points, depth = surface_points(view), view.depth.numpy()
+        points, depth = points_of_view(view), view.depth.numpy()
         inside = ((points >= low) & (points <= high)).all(axis=1)
         pixels = tuple(index[inside] for index in np.nonzero(depth))
         of_mesh, of_scene = mesh_depth(mesh, view.camera)[pixels], depth[pixels]

@@ -11,7 +11,7 @@ function turned(v, axis, angle) {  // Rodrigues
 }
 
 // Of pictures from the place of a panorama or a fisheye photo, which are perspective: 75 degrees of the shorter side.
-const FROM_WIDE = {width: 2, height: 2, fx: 1 / Math.tan(0.6545), fy: 1 / Math.tan(0.6545), cx: 1, cy: 1};
+const WIDE_PHOTO_LENS = {width: 2, height: 2, fx: 1 / Math.tan(0.6545), fy: 1 / Math.tan(0.6545), cx: 1, cy: 1};
 
 class FlyingCamera {
   constructor(up) { this.up = unit(up); }
@@ -19,7 +19,7 @@ class FlyingCamera {
   // Takes a camera's place; an orbit turns about a point ahead, at the focus of the scene or half its size away.
   jump(camera, {focus, size}) {
     const m = camera.world_to_camera, ahead = focus ? dot(add(focus, centerOf(camera), -1), m[2].slice(0, 3)) : 0;
-    this.lens = camera.projection ? FROM_WIDE : camera, this.ahead = ahead > 0 ? ahead : size / 2;
+    this.lens = camera.projection ? WIDE_PHOTO_LENS : camera, this.ahead = ahead > 0 ? ahead : size / 2;
     this.right = m[0].slice(0, 3), this.down = m[1].slice(0, 3), this.forward = m[2].slice(0, 3);
     this.position = centerOf(camera);
   }
@@ -104,13 +104,13 @@ function between(from, to) {
   return b.slice(0, 3).flatMap(row => [...[0, 1, 2].map(j => dot(row, a[j])), dot(row, center) + row[3]]).concat([0, 0, 0, 1]);
 }
 const lensOf = c => [c.fx / c.width, c.fy / c.height, c.cx / c.width, c.cy / c.height];
-// How a photo's camera sees, for LightCanvas: its shape (0 pinhole, 1 panorama, 2 fisheye), k1 to k4, and its widest angle.
-function sightOf(c) {
-  if (!c.projection || c.projection === "equirectangular") return {shape: c.projection ? 1 : 0};
-  const bend = [0, 1, 2, 3].map(i => c.distortion[i] || 0), steps = 2048;
-  const radius = t => t * (1 + bend.reduce((sum, k, i) => sum + k * t ** (2 * i + 2), 0));
+// A photo's projection for LightCanvas: 0 pinhole, 1 panorama, 2 fisheye, with its distortion k1 to k4 and widest angle.
+function projectionOf(c) {
+  if (!c.projection || c.projection === "equirectangular") return {projection: c.projection ? 1 : 0};
+  const distortion = [0, 1, 2, 3].map(i => c.distortion[i] || 0), steps = 2048;
+  const radius = t => t * (1 + distortion.reduce((sum, k, i) => sum + k * t ** (2 * i + 2), 0));
   const angles = [...Array(steps).keys()].map(i => i / (steps - 1) * Math.PI), last = angles.findIndex((t, i) => i && radius(t) <= radius(angles[i - 1]));
-  return {shape: 2, bend, reach: last < 0 ? 4 : angles[last - 1]};
+  return {projection: 2, distortion, widestAngle: last < 0 ? 4 : angles[last - 1]};
 }
 function project(camera, point) {  // Pixels, or null behind
   const m = camera.world_to_camera, [x, y, z] = [0, 1, 2].map(i => dot(m[i], point) + m[i][3]);

@@ -26,10 +26,10 @@ uniform sampler2D scene, other, depth, clipped, photo, curve;
 uniform float gain, grey, white, split, near, far;
 uniform mat4 toPhoto;                        // camera of the view to camera of the photo
 uniform vec4 lens, photoLens;                // fx, fy, cx, cy over width and height
-uniform vec4 bend;                           // k1 to k4 of a fisheye photo
-uniform float reach;                         // its widest angle from the axis
+uniform vec4 distortion;                     // k1 to k4 of a fisheye photo
+uniform float widestAngle;                   // its widest angle from the axis
 
-// tone and overlay: of the lists above. left of the split: 0 scene, 1 other, 2 photo. shape of the photo: 0 pinhole, 1 panorama, 2 fisheye
+// tone and overlay: of the lists above. left of the split: 0 scene, 1 other, 2 photo. projection of the photo: 0 pinhole, 1 panorama, 2 fisheye
 const vec3 LUMINANCE = vec3(0.2126, 0.7152, 0.0722);
 
 vec3 srgb(vec3 x) {
@@ -86,15 +86,15 @@ bool photographed(vec2 uv, out vec3 photoColor) {  // What the photo shows of th
   vec3 q = (toPhoto * vec4(p.z > 0.0 ? p : vec3((uv - lens.zw) / lens.xy, 1.0) * far, 1.0)).xyz;
   vec2 on = q.xy / q.z * photoLens.xy + photoLens.zw;
   bool within = q.z > 0.0;
-  if (shape == 1) {                          // A panorama
+  if (projection == 1) {                     // A panorama
     on = vec2(0.5 + atan(q.x, q.z) / 6.28318531, 0.5 + asin(clamp(q.y / max(length(q), 1e-12), -1.0, 1.0)) / 3.14159265);
     within = true;
   }
-  if (shape == 2) {                          // A fisheye lens
+  if (projection == 2) {                     // A fisheye lens
     float angle = atan(length(q.xy), q.z), a = angle * angle;
-    on = q.xy / max(length(q.xy), 1e-12) * angle * (1.0 + a * (bend.x + a * (bend.y + a * (bend.z + a * bend.w))));
+    on = q.xy / max(length(q.xy), 1e-12) * angle * (1.0 + a * (distortion.x + a * (distortion.y + a * (distortion.z + a * distortion.w))));
     on = on * photoLens.xy + photoLens.zw;
-    within = angle < reach;
+    within = angle < widestAngle;
   }
   photoColor = texture(photo, on).rgb;
   return within && all(greaterThan(on, vec2(0.0))) && all(lessThan(on, vec2(1.0)));
@@ -149,7 +149,7 @@ class LightCanvas {
     this.canvas = canvas, this.gl = gl, this.textures = {}, this.frames = {}, this.programs = {}, this.stale = new Set();
     this.drawn = -Infinity, this.scale = this.wide = 1, this.changes = 0;
     this.settings = {stops: 0, tone: "none", white: 4, overlay: "none", split: 0, left: 0, grey: 1, near: 1, far: 1,
-                     toPhoto: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], lens: [1, 1, .5, .5], photoLens: [1, 1, .5, .5], shape: 0, bend: [0, 0, 0, 0], reach: 0};
+                     toPhoto: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], lens: [1, 1, .5, .5], photoLens: [1, 1, .5, .5], projection: 0, distortion: [0, 0, 0, 0], widestAngle: 0};
     if (!gl) return;
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     TEXTURES.forEach((name, unit) => {
@@ -249,14 +249,14 @@ class LightCanvas {
     this.stale.clear();
     if (this.paper && (canvas.width < width || canvas.height < height)) canvas.width = Math.max(width, canvas.width), canvas.height = Math.max(height, canvas.height);
     const comparesPhoto = s.left === 2 || s.overlay === "error";
-    const chosen = {tone: TONES.indexOf(s.tone), overlay: OVERLAYS.indexOf(s.overlay), left: s.left, shape: comparesPhoto ? s.shape : 0};
+    const chosen = {tone: TONES.indexOf(s.tone), overlay: OVERLAYS.indexOf(s.overlay), left: s.left, projection: comparesPhoto ? s.projection : 0};
     const {program, places} = this.program(chosen), at = name => places[name] ??= gl.getUniformLocation(program, name);
     gl.useProgram(program);
-    for (const [name, value] of Object.entries({gain: 2 ** s.stops, grey: s.grey, white: s.white, split: s.split, near: s.near, far: s.far, reach: s.reach}))
+    for (const [name, value] of Object.entries({gain: 2 ** s.stops, grey: s.grey, white: s.white, split: s.split, near: s.near, far: s.far, widestAngle: s.widestAngle}))
       gl.uniform1f(at(name), value);
     gl.uniform4fv(at("lens"), s.lens);
     gl.uniform4fv(at("photoLens"), s.photoLens);
-    gl.uniform4fv(at("bend"), s.bend);
+    gl.uniform4fv(at("distortion"), s.distortion);
     gl.uniformMatrix4fv(at("toPhoto"), true, s.toPhoto);
     gl.viewport(0, 0, width, height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -174,7 +174,7 @@ function paint() {
   if (!drawn || !facts) return;
   // A photo that is still being read is not compared with.
   const ready = state.photoReady === state.photo, left = $("left").value === "photo" && !ready ? "0" : $("left").value, split = left === "0" ? 0 : state.split, view = facts.views[state.photo];
-  const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera), ...sightOf(view.camera)} : {};
+  const photo = view ? {toPhoto: between(drawn.camera, view.camera), photoLens: lensOf(view.camera), ...projectionOf(view.camera)} : {};
   light.draw({stops: state.stops, tone: $("tone").value, white: 2 ** Number($("white").value), overlay: $("overlay").value === "error" && !ready ? "none" : $("overlay").value,
               split, left: left === "photo" ? 2 : left === "0" ? 0 : 1, lens: lensOf(drawn.camera), ...photo});
   $("whiteLabel").textContent = stopsText(Number($("white").value));

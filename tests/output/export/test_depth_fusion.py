@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sehdr_warp.errors import SehdrError
-from sehdr_warp.output.export.depth_fusion import DepthView, depth_views, fuse_depth, mesh_bounds, surface_points
+from sehdr_warp.output.export.depth_fusion import DepthView, depth_views, fuse_depth, mesh_bounds, points_of_view
 from sehdr_warp.output.world_transform import WorldTransform
 from sehdr_warp.scene import Camera, look_at
 
@@ -23,7 +23,7 @@ def wall(position) -> DepthView:
 
 def test_a_wall_is_at_its_place_and_outside_is_where_cameras_stand():
     views = [wall(place) for place in ((0, 0, 3), (1, 0, 3), (0, 1, 3))]
-    assert np.abs(np.concatenate([surface_points(view) for view in views])[:, 2]).max() < 1e-5
+    assert np.abs(np.concatenate([points_of_view(view) for view in views])[:, 2]).max() < 1e-5
     low, high = mesh_bounds(views, None)
     assert low[2] < 0 < high[2] and high[0] - low[0] > 1
     distance, weight, light = fuse_depth(views, np.array([-0.2, -0.2, -0.5]), np.full(3, 0.02), (20, 20, 50))
